@@ -466,7 +466,7 @@ def _information_in(
         if "honest_std" in values:
             honest, formal = (np.array(values[k], dtype=np.float64) for k in ("honest_std", "std"))
             ratio = honest / np.where(formal > 0.0, formal, np.nan)
-            noise = {str(name): float(sigma) for name, sigma in values["sigma"].items()}
+            noise = {str(name): float(s) for name, s in values.get("sigma", {}).items()}
     except (ValueError, KeyError, TypeError, AttributeError):
         raise RecordingError(f"{path}: neither a design.json nor an estimate.json") from None
 
@@ -475,6 +475,8 @@ def _information_in(
             raise RecordingError(
                 f"{path}: its information is not {len(names)} x {len(names)} finite numbers"
             )
+    if ratio is not None and ratio.shape != (len(names),):
+        raise RecordingError(f"{path}: its honest_std and std are not {len(names)} numbers each")
     return names, data, prior, ratio, noise
 
 

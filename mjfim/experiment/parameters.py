@@ -269,7 +269,8 @@ def _nuisance(
             _deviation("output:delay", stated.delay, "s", per_recording=stated.per_recording),
         )
     # What a parameter sets is no nuisance.
-    known = {each.path for spec in experiment.parameters.values() for each in spec.all_targets}
+    targets = [each for spec in experiment.parameters.values() for each in spec.all_targets]
+    known = {_number(target.path) for target in targets}
     time = period / LEAST_MOVE_PER_SAMPLE
     forces = force_sizes(source.model, time)
     inertias = forces * time**2 / position_sizes(source.model)
@@ -279,7 +280,9 @@ def _nuisance(
     ):
         values = getattr(source.model, f"dof_{field}")
         paths = {joint.name: f"joint/{joint.name}:{field}" for joint in coordinates.scalar_joints}
-        places = {j.name: j.v for j in coordinates.scalar_joints if paths[j.name] not in known}
+        places = {
+            j.name: j.v for j in coordinates.scalar_joints if _number(paths[j.name]) not in known
+        }
         for name, prior in _priors_by_name(f"nuisance.{key}", getattr(stated, key), list(places)):
             place = places[name]
             yield (
@@ -291,6 +294,12 @@ def _nuisance(
                     nuisance=True,
                 ),
             )
+
+
+def _number(text: str) -> tuple[str, str, str, int]:
+    """Kind and name of the element, field and component of a path."""
+    path = ParameterPath.parse(text)
+    return path.kind, path.name, path.field, path.component
 
 
 def _deviation(path: str, prior: Any, unit: str, *, per_recording: bool) -> ParameterSpec:

@@ -192,6 +192,8 @@ class ControllerSpec(Section):
         """Refuse an inverted range, and a law that computes nothing."""
         if self.saturation is not None and not self.saturation[0] < self.saturation[1]:
             raise ValueError(f"saturation {list(self.saturation)} needs lower < upper")
+        if self.jump is not None and self.acceleration is None:
+            raise ValueError("jump needs acceleration; without a profile, all changes pass at once")
 
         stated = {"kp", "kd", "ki", "feedforward"} & self.model_fields_set
         if not stated:

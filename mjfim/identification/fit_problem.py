@@ -192,19 +192,20 @@ class FitProblem(SegmentSimulation):
         wanted = max(samples * count // self.sample_count, least)
         return spread_over_data(count, min(wanted, count))
 
-    def of_first_parts(self, share: float) -> FitProblem:
+    def of_first_parts(self, share: float, most: int | None = None) -> FitProblem:
         """The problem of the first part of every segment only.
 
         It shows the initial states nearly as well, at less cost.
 
         Args:
             share: Share of the rows of a segment that count.
+            most: Largest number of these rows; None for any.
 
         Returns:
             The problem, with as many segments.
         """
         segments = tuple(
-            segment.first_part(self.recordings[segment.recording], share)
+            segment.first_part(self.recordings[segment.recording], share, most)
             for segment in self.segments
         )
         return replace(self, segments=segments)

@@ -190,8 +190,7 @@ def with_initial_states(
     # Deviations of the initial state that were fitted belong to other recordings.
     begin = replace(at, private=problem.begin(problem.parameters.guess).private)
     held = problem.masked(known).with_shared_held()
-    longest = max(segment.rows.stop - segment.rows.start for segment in held.segments)
-    first = held.of_first_parts(min(INITIAL_STATE_ROWS / longest, 1.0))
+    first = held.of_first_parts(1.0, INITIAL_STATE_ROWS)
     if len(first.segments_with_values) == len(held.segments):
         held = first
     found = minimise(held, begin, INITIAL_STATES, budget)

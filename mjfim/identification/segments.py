@@ -231,15 +231,19 @@ class Segment:
     rows: slice
     start: Array
 
-    def first_part(self, recording: AlignedRecording, share: float) -> Segment:
+    def first_part(
+        self, recording: AlignedRecording, share: float, most: int | None = None
+    ) -> Segment:
         """The first rows of this segment, and the samples that they need.
 
         Args:
             recording: Its recording.
             share: Share of the rows.
+            most: Largest number of rows; None for any.
         """
         count = self.rows.stop - self.rows.start
-        last = self.rows.start + max(int(np.ceil(share * count)), min(count, MIN_SAMPLES))
+        wanted = max(int(np.ceil(share * count)), min(count, MIN_SAMPLES))
+        last = self.rows.start + (wanted if most is None else min(wanted, most))
         end = recording.t[last - 1] / recording.dt
         samples = int(np.ceil(end - EDGE_TOLERANCE)) - self.begin
         return replace(

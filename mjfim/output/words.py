@@ -180,10 +180,11 @@ def sigma_remark(inflation: Array, names: Sequence[str]) -> str:
     if not len(inflation):
         return BEST_CASE
     low, high = int(np.argmin(inflation)), int(np.argmax(inflation))
+    least, most = (number(inflation[i], 2) for i in (low, high))
+    times = least if least == most else f"{least} ({names[low]}) to {most} ({names[high]})"
     return (
         "σ allows for residuals like those of the earlier estimates: it is about "
-        f"{number(inflation[low], 2)} ({names[low]}) to {number(inflation[high], 2)} "
-        f"({names[high]}) times that under white noise."
+        f"{times} times that under white noise."
     )
 
 

@@ -201,7 +201,10 @@ class LawCommands:
 
         received = columns.at("reference", columns.places - latency)
         filtered = _filtered(received, shares)
-        reference, slope = _profiled(filtered, numbers, ticks, memory)
+        jumps = columns.changes("reference", columns.places - latency) > numbers.jump
+        # A command that arrives inside a tick counts in part there, and in the next one in full.
+        jumps[1:] |= jumps[:-1].copy()
+        reference, slope = _profiled(filtered, jumps, numbers, ticks, memory)
         velocity = columns.late("reference_velocity", latency)
         if velocity is not None:
             velocity = _filtered(velocity, shares)
@@ -263,16 +266,27 @@ class _Columns:
             quantity: The quantity.
             places: (K, m, c) begin of the means, in samples since the begin of the window.
         """
-        W = self.window.shape[1]
-        place = np.clip(places, 0.0, W - 1.0)
-        sample = np.floor(place).astype(np.intp)
+        sample, share = self._samples(places)
         values = self._values(quantity, sample, 0.0)
-        following = self._values(quantity, np.minimum(sample + 1, W - 1), 0.0)
-
-        # Share of the mean that lies in the following sample.
-        widths = self.widths
-        share = np.maximum((place - sample) + (widths - 1.0), 0.0) / widths
+        following = self._values(quantity, self._following(sample), 0.0)
         return (1.0 - share) * values + share * following
+
+    def changes(self, quantity: Quantity, places: Array) -> Array:
+        """(K, m, c) changes of a quantity since the tick before, in the latest sample of a mean."""
+        sample, share = self._samples(places)
+        latest = np.where(share > 0.0, self._following(sample), sample)
+        values = self._values(quantity, latest, 0.0)
+        return np.asarray(np.abs(np.diff(values, axis=0, prepend=values[:1])))
+
+    def _samples(self, places: Array) -> tuple[np.ndarray, Array]:
+        """Samples in which means begin, and the share of each mean in the following sample."""
+        place = np.clip(places, 0.0, self.window.shape[1] - 1.0)
+        sample = np.floor(place).astype(np.intp)
+        widths = self.widths
+        return sample, np.maximum((place - sample) + (widths - 1.0), 0.0) / widths
+
+    def _following(self, sample: np.ndarray) -> np.ndarray:
+        return np.minimum(sample + 1, self.window.shape[1] - 1)
 
     def late(self, quantity: Quantity, latency: Array) -> Array | None:
         """(K, m, c) quantity at the ticks, late by (m, c) samples; None where no law reads it."""
@@ -342,12 +356,17 @@ def _filtered(values: Array, shares: Array) -> Array:
 
 
 def _profiled(
-    values: Array, numbers: LawNumbers, ticks: Ticks, memory: LawMemory | None
+    values: Array,
+    jumps: np.ndarray,
+    numbers: LawNumbers,
+    ticks: Ticks,
+    memory: LawMemory | None,
 ) -> tuple[Array, Array]:
     """References after the motion profiles of laws, and velocities of the profiles.
 
     Args:
         values: (K, m, c) references at successive ticks.
+        jumps: (K, m, c) True where the reference passes without the profile.
         numbers: Numbers of the laws.
         ticks: The ticks.
         memory: Memory at the begin of the curves; None for profiles that begin at rest, with the
@@ -363,7 +382,7 @@ def _profiled(
 
     T = ticks.seconds
     x, largest = values[:, chosen], numbers.acceleration[chosen] * T
-    jumps = np.abs(np.diff(x, axis=0, prepend=x[:1])) > numbers.jump[chosen]
+    jumps = jumps[:, chosen]
     first = 0 if memory is None else ticks.before
     p, v = x[0], np.zeros_like(x[0])
     if memory is not None:

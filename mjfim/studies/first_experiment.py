@@ -795,8 +795,8 @@ ABOVE = {
     "parameters": [
         f"Unknown parameters: at most {MOST_PARAMETERS} that the first motion identifies together,",
         "one for equal joints of a large robot. `mjfim list MODEL` lists every path.",
-        "For friction, rotors and a delay that the model lacks, add a table [nuisance] with",
-        "friction = true, armature = true and delay = true.",
+        "For friction and a delay that the model lacks, add a table [nuisance] with",
+        "friction = true and delay = true, and with the armature of driven joints.",
     ],
     "boundary": [
         'end = "rest" lets the motion end at a standstill; "free" gives more information.'
@@ -814,7 +814,7 @@ BEHIND = {
     "limits.position": "about the start; for a soft range of the MJCF, so wide that it holds there",
     "limits.tendon_length": "wider than in the MJCF, whose soft range the state at rest exceeds",
     "limits.clearance": "between bodies [m]; ignored pairs are nearer at the start",
-    "limits.floor": "height of a floor with which the MJCF has no contacts [m]",
+    "limits.floor": "height of the floor, which not all bodies touch in the MJCF [m]",
     "limits.reserve": "as much as robots that differ from the model need",
     "limits.bandwidth": "of the controls [Hz]; a larger one gives more information",
     "rehearsal.feedback": "open loop, a small error of the thrust lets the robot fall",

@@ -191,7 +191,9 @@ def _clearance(source: ModelSource, positions: Array, least: float) -> dict[str,
     model, stated = source.model, {"clearance": least}
     height = find_floor(model, positions[0]).height
     height = rounded(height, 6) if abs(height) > ZERO_HEIGHT * least else 0.0
-    if np.isfinite(height) and not _collides_with_planes(model):
+    # A stated floor is a height over z, and that of the rehearsal one against gravity.
+    is_upright = model.opt.gravity[2] <= 0.0 and not model.opt.gravity[:2].any()
+    if is_upright and np.isfinite(height) and not _collides_with_planes(model):
         stated["floor"] = height
         model = with_floor(source, height).model
     try:

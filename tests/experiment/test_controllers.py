@@ -42,6 +42,10 @@ FAULTS: dict[str, tuple[dict[str, Any], str]] = {
         {"controllers": {"shoulder": {"kp": -1.0}}},
         "controllers.shoulder.kp … greater than or equal to 0 … -1",
     ),
+    "jump without a profile": (
+        {"controllers": {"shoulder": PD | {"jump": 0.1}}},
+        "controllers.shoulder: jump needs acceleration",
+    ),
     "nothing": (
         {"controllers": {"shoulder": {"rate": 500.0}}},
         "controllers.shoulder: the law computes nothing … kp, kd, ki or feedforward",

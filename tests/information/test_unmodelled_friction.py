@@ -98,7 +98,7 @@ def test_sigma_beside_unknown_friction_is_that_of_the_whole_inverse(
     task = DesignTask.resolve(experiment(tmp_path, friction, nuisance={"friction": True}))
     ctrl = task.control
 
-    assert task.theta[2] == friction or friction == 0.0
+    assert task.theta[2] == friction if friction else 0.0 < task.theta[2] < 0.1
     columns = []
     for step in np.diag([1e-4, 1e-4, 1e-5]):
         ahead, behind = played(ctrl, *(task.theta + step)), played(ctrl, *(task.theta - step))

@@ -128,6 +128,27 @@ def test_a_law_equals_a_plain_loop(name: str) -> None:
     assert np.abs(expected - oracle(system, {"kp": 0.0}, inputs)).max() > 0.05
 
 
+def test_a_jump_passes_at_any_latency() -> None:
+    """The motion is continuous in the latency, wherever the jump arrives inside a tick."""
+    law = {"kp": 50.0, "kd": 4.0, "rate": 250.0, "acceleration": 39.0, "jump": 0.15}
+    system = System.resolve(arm_experiment({"shoulder": law}))
+    inputs = np.zeros((SAMPLES, 2))
+    inputs[20:, 0] = 0.24
+    late = np.arange(0.008, 0.0161, 0.0005)
+    models = []
+    for latency in late:
+        other = System.resolve(arm_experiment({"shoulder": law | {"latency": latency}}))
+        models.append(other.plant.model(other.parameters.guess))
+
+    m = len(models)
+    starts, logs = np.zeros((m, 4)), np.repeat(inputs[None], m, axis=0)
+    q = system.plant.simulator.rollout(models, starts, logs).states[:, 45, 0]
+
+    # All of the step acts at once: a profile alone would need 0.16 s.
+    assert q.min() > 0.015
+    assert np.abs(np.diff(q)).max() < 0.15 * np.ptp(q)
+
+
 def test_simulations_of_one_batch_have_their_own_numbers() -> None:
     law = LAWS["late feedback"] | {"latency": 0.003, "time_constant": 0.01, "ki": 20.0}
     system = System.resolve(arm_experiment({"shoulder": law, "elbow": LAWS["slow"]}))

@@ -123,8 +123,14 @@ def evaluate(
     memory["filtered"] = filtered
     if math.isfinite(law.acceleration):
         p, s = memory["profile"] or (filtered, 0.0)
-        last, T = previous, law.tick * h
-        if abs(filtered - last) > law.jump:
+        # The latest row of the log that counts at this tick; a jump counts at two ticks.
+        rows = signals["reference"]
+        latest = math.ceil((t - law.latency + width) / dt - 1e-9) - 1
+        row = float(rows[min(max(latest, 0), len(rows) - 1)])
+        has_jumped = abs(row - memory.get("row", row)) > law.jump
+        is_jump = has_jumped or memory.get("jumped", False)
+        memory["row"], memory["jumped"] = row, has_jumped
+        if is_jump:
             p, s = filtered, 0.0
         else:
             e, a = filtered - p, law.acceleration

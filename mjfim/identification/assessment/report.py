@@ -513,8 +513,8 @@ def _contradictions(result: FitResult, comparison: RecordingComparison | None) -
         )
     yield (
         f"recordings disagree on {first_ones(apart)} by more than the scatter within each "
-        "recording: it moves with the excitation, or something else differs between them that is "
-        "not in the model; the intervals allow for it"
+        "recording. They may depend on the excitation, or something differs between the "
+        "recordings that the model lacks. The intervals allow for it"
     )
 
 
