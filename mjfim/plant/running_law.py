@@ -286,7 +286,7 @@ class _Columns:
         return sample, np.maximum((place - sample) + (widths - 1.0), 0.0) / widths
 
     def _following(self, sample: np.ndarray) -> np.ndarray:
-        return np.minimum(sample + 1, self.window.shape[1] - 1)
+        return np.asarray(np.minimum(sample + 1, self.window.shape[1] - 1))
 
     def late(self, quantity: Quantity, latency: Array) -> Array | None:
         """(K, m, c) quantity at the ticks, late by (m, c) samples; None where no law reads it."""
