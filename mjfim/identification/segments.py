@@ -244,6 +244,8 @@ class Segment:
         count = self.rows.stop - self.rows.start
         wanted = max(int(np.ceil(share * count)), min(count, MIN_SAMPLES))
         last = self.rows.start + (wanted if most is None else min(wanted, most))
+        if last == self.rows.stop:
+            return self
         end = recording.t[last - 1] / recording.dt
         samples = int(np.ceil(end - EDGE_TOLERANCE)) - self.begin
         return replace(

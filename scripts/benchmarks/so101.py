@@ -51,6 +51,9 @@ SHOWN = {
     "slow_precision": (("shoulder_lift", "elbow_flex"), 200, 1200),
 }
 
+# Quantities that are compared by their ratio to kp: unit of the ratio, and its scale.
+QUANTITIES = {"damping": ("ms", 1e3), "friction": ("mrad", 1e3), "armature": ("ms²", 1e6)}
+
 # Published sets: rows of kp, -kp, -kd, armature, dry friction and viscous friction.
 PUBLISHED = {
     "so101_new_calib": "998.22 | -998.22 | -2.731 | 0.028 | 0.052 | 0.60",
@@ -181,14 +184,13 @@ def ratios_table(found: mjfim.Estimate) -> Table:
     Torques have no scale without a load, so that sets with other gains may move alike. Intervals
     are those of the numerators.
     """
-    quantities = {"damping": ("ms", 1e3), "friction": ("mrad", 1e3), "armature": ("ms²", 1e6)}
-    heads = [f"{name} / kp [{unit}]" for name, (unit, _) in quantities.items()]
+    heads = [f"{name} / kp [{unit}]" for name, (unit, _) in QUANTITIES.items()]
     table = new_table(f"estimate | {', '.join(PUBLISHED)}", "joint", *heads)
     places = {name: i for i, name in enumerate(found.parameters)}
     published = [[numbers_of(row) for row in text.split("|")] for text in PUBLISHED.values()]
     for number, joint in enumerate(JOINTS):
         cells = []
-        for name, (_, scale) in quantities.items():
+        for name, (_, scale) in QUANTITIES.items():
             own = f"{name}_{joint}"
             place = places[own if own in places else name]
             value, (low, high) = found.theta[place], found.interval[place]
@@ -205,7 +207,9 @@ def ratios_table(found: mjfim.Estimate) -> Table:
 
 def draw_predictions(motions: Sequence[Array], predictions: Sequence[Prediction]) -> Figure:
     """Draw the parts of `SHOWN`: measured angles, their references, and their predictions."""
-    figure, rows = plt.subplots(2, 2, figsize=(13.0, 6.5), layout="constrained")
+    figure, rows = plt.subplots(
+        2, len(motions), figsize=(13.0, 6.5), layout="constrained", squeeze=False
+    )
     parts = zip(rows.T, SHOWN.items(), motions, predictions, strict=True)
     for axes, (name, (joints, first, last)), motion, prediction in parts:
         rows_shown = slice(first, last)

@@ -36,12 +36,15 @@ def test_published_sets_have_their_known_errors(motion: str, expected: list[floa
 def test_a_fit_to_seconds_predicts_the_motion(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Gains from two seconds of the multisine predict its first six better than published ones."""
+    """Servos from two seconds of the multisine predict its first six better than published ones."""
     whole = so101.read_motion(DATA / "multisine")[:300]
     monkeypatch.setattr(so101, "FITTED", {"multisine": (0, 100)})
     monkeypatch.setattr(so101, "HELD_OUT", "")
-    # The gains alone; other numbers stay those of the model.
-    monkeypatch.setattr(so101, "JOINT", so101.JOINT.split("[parameters.latency")[0])
+    # Delays and drag keep their guesses.
+    law, rest = so101.JOINT.split("[parameters.latency_JOINT]")
+    frictions = rest[rest.index("[parameters.damping") : rest.index("[parameters.drag")]
+    monkeypatch.setattr(so101, "JOINT", law + frictions)
+    monkeypatch.setattr(so101, "SHOWN", {"multisine": (("wrist_roll", "gripper"), 0, 300)})
     monkeypatch.setattr(so101, "read_motion", lambda folder: whole)
     monkeypatch.setattr("sys.argv", ["so101", str(DATA), str(MODEL), str(tmp_path)])
 
