@@ -297,8 +297,11 @@ def _nuisance(
 
 
 def _number(text: str) -> tuple[str, str, str, int]:
-    """Kind and name of the element, field and component of a path."""
-    path = ParameterPath.parse(text)
+    """Kind and name of the element, field and component of a path; nothing of a malformed one."""
+    try:
+        path = ParameterPath.parse(text)
+    except ExperimentError:
+        return "", "", "", 0
     return path.kind, path.name, path.field, path.component
 
 
