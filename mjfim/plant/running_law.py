@@ -201,10 +201,12 @@ class LawCommands:
 
         received = columns.at("reference", columns.places - latency)
         filtered = _filtered(received, shares)
-        jumps = columns.changes("reference", columns.places - latency) > numbers.jump
-        # A command that arrives inside a tick counts in part there, and in the next one in full.
-        jumps[1:] |= jumps[:-1].copy()
-        reference, slope = _profiled(filtered, jumps, numbers, ticks, memory)
+        reference, slope = filtered, np.broadcast_to(0.0, filtered.shape)
+        if np.isfinite(numbers.acceleration).any():
+            jumps = columns.changes("reference", columns.places - latency) > numbers.jump
+            # A command that arrives inside a tick counts in part there, and in full in the next.
+            jumps[1:] |= jumps[:-1].copy()
+            reference, slope = _profiled(filtered, jumps, numbers, ticks, memory)
         velocity = columns.late("reference_velocity", latency)
         if velocity is not None:
             velocity = _filtered(velocity, shares)
@@ -377,9 +379,6 @@ def _profiled(
     """
     velocities = np.zeros_like(values)
     chosen = np.isfinite(numbers.acceleration)
-    if not chosen.any():
-        return values, velocities
-
     T = ticks.seconds
     x, largest = values[:, chosen], numbers.acceleration[chosen] * T
     jumps = jumps[:, chosen]

@@ -26,9 +26,9 @@ from tests.fuzz.inputs import make_study
 from tests.fuzz.outcome import Case, Outcome
 from tests.fuzz.result_files import faults_of, is_temporary
 from tests.fuzz.workers import announce
-from tests.support.cli import PROCESS, write_experiment
+from tests.support.cli import PROCESS, write_experiment, write_wrong_guess
 from tests.support.contents import contents
-from tests.support.paths import MODELS, ROOT, SCRIPTS
+from tests.support.paths import ROOT, SCRIPTS
 
 # Hard limits of a study.
 LIMITS = "[limits]\nposition = { slide = [-1.0, 1.0] }\ncontrol = { force = [-5.0, 5.0] }\n"
@@ -167,16 +167,7 @@ def valid_study() -> Path:
         (folder / f"{name}.toml").write_text(text, encoding="utf-8")
 
     # With a wrong guess, for campaigns.
-    text = (MODELS / "cart_pendulum_guess.toml").read_text(encoding="utf-8")
-    for old, new in (
-        ("horizon = 4.0", "horizon = 1.0"),
-        ('"cart_pendulum.csv"', '{ kind = "sine", amplitude = 2.0, frequency = 0.8 }'),
-        ("starts = 4", "starts = 1"),
-        ("tolerance = 1e-7", "tolerance = 1e-3"),
-        ("max_iterations = 200", "max_iterations = 30"),
-    ):
-        text = text.replace(old, new, 1)
-    (folder / "guess.toml").write_text(text, encoding="utf-8")
+    write_wrong_guess(folder / "guess.toml")
 
     make_study(folder, folder / "made")
     shutil.copy(folder / "made" / "design.npz", folder)

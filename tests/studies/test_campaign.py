@@ -37,7 +37,7 @@ from mjfim.records.trajectory import Recording
 from mjfim.studies import campaign as campaign_module
 from mjfim.studies.campaign import restate_experiment
 from tests.support.cart_pendulum import cart_pendulum
-from tests.support.cli import PROCESS, misused, names, read, run
+from tests.support.cli import PROCESS, misused, names, read, run, write_wrong_guess
 from tests.support.made_records import bare_estimate
 from tests.support.numerics import cart_task
 from tests.support.paths import MODELS
@@ -260,18 +260,7 @@ def write_study(folder: Path) -> Path:
     """The study as a file."""
     for name in ("cart_pendulum.xml", "cart_pendulum.csv"):
         shutil.copy(MODELS / name, folder)
-    text = (MODELS / "cart_pendulum_guess.toml").read_text(encoding="utf-8")
-    for old, new in (
-        ("horizon = 4.0", "horizon = 1.0"),
-        ('"cart_pendulum.csv"', '{ kind = "sine", amplitude = 2.0, frequency = 0.8 }'),
-        ("starts = 4", "starts = 1"),
-        ("tolerance = 1e-7", "tolerance = 1e-3"),
-        ("max_iterations = 200", "max_iterations = 30"),
-    ):
-        assert old in text
-        text = text.replace(old, new, 1)
-    (folder / "study.toml").write_text(f"rehearsal.robots = 4\n{text}", encoding="utf-8")
-    return folder / "study.toml"
+    return write_wrong_guess(folder / "study.toml", first="rehearsal.robots = 4")
 
 
 WANTED = ("--wanted", 0.0055)

@@ -89,6 +89,30 @@ def done(*words: object, code: int = 0) -> Result:
     return result
 
 
+def write_wrong_guess(path: Path, first: str = "") -> Path:
+    """Write a quick study with a wrong guess, for campaigns; its model and control stand beside it.
+
+    Args:
+        path: The new experiment file.
+        first: Its first line.
+
+    Returns:
+        The path.
+    """
+    text = (MODELS / "cart_pendulum_guess.toml").read_text(encoding="utf-8")
+    for old, new in (
+        ("horizon = 4.0", "horizon = 1.0"),
+        ('"cart_pendulum.csv"', '{ kind = "sine", amplitude = 2.0, frequency = 0.8 }'),
+        ("starts = 4", "starts = 1"),
+        ("tolerance = 1e-7", "tolerance = 1e-3"),
+        ("max_iterations = 200", "max_iterations = 30"),
+    ):
+        assert old in text
+        text = text.replace(old, new, 1)
+    path.write_text(f"{first}\n{text}", encoding="utf-8")
+    return path
+
+
 def write_experiment(home: Path, **lines: str) -> Path:
     """Write the study of the paper with a short horizon and a loose tolerance.
 
