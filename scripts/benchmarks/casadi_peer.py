@@ -26,7 +26,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from types import SimpleNamespace
 from typing import Any
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -71,57 +71,17 @@ MEMORY = 40
 # Places of the six entries of the information, which is symmetric: its upper triangle.
 ENTRIES = tuple((i, j) for j in range(NP) for i in range(j + 1))
 
-
-@dataclass(frozen=True)
-class Case:
-    """One row of the study.
-
-    Attributes:
-        name: Letter of the case.
-        theta: Parameters m [kg], l [m] and c [N m s/rad].
-        r_tau: Weight of the control [1/(N² s)].
-        q_slide: Weight of the cart position [1/(m² s)].
-    """
-
-    name: str
-    theta: tuple[float, float, float]
-    r_tau: float
-    q_slide: float
+# The initial state with sensitivities of zero: (16,).
+START = ca.DM([*X0, *([0.0] * (NZ - NX))])
 
 
-# True parameters of the study.
+# True parameters of the study: m [kg], l [m] and c [N m s/rad].
 ACTUAL = (2.0, 1.0, 1.0)
 
-# Rows of the study by their letters.
-CASES = {
-    "a": Case("a", ACTUAL, 6e-3, 0.0),
-    "b": Case("b", ACTUAL, 1e-3, 0.05),
-    "c": Case("c", ACTUAL, 1e-4, 0.0),
-    "f": Case("f", ACTUAL, 1e-6, 0.0),
-}
+# Weights of the control [1/(N² s)] and of the cart position [1/(m² s)] by the letter of the case.
+CASES = {"a": (6e-3, 0.0), "b": (1e-3, 0.05), "c": (1e-4, 0.0), "f": (1e-6, 0.0)}
 
-
-@dataclass(frozen=True)
-class PeerRun:
-    """Outcome of one run of a peer solver.
-
-    Attributes:
-        name: Name of the solver.
-        case: Letter of the case.
-        J: Cost of the solution.
-        iterations: Number of iterations.
-        seconds: Time of the solver alone [s].
-        setup_seconds: Time for x_d and the solver object of this case [s].
-        history: Time since the start of the solver [s] and lowest J up to then.
-    """
-
-    name: str
-    case: str
-    J: float
-    iterations: int
-    seconds: float
-    setup_seconds: float
-    history: tuple[tuple[float, float], ...]
+Case = tuple[float, float]
 
 
 def reference_control() -> Array:
@@ -173,20 +133,6 @@ def rk4(x: ca.SX, u: ca.SX, theta: ca.SX) -> ca.SX:
     return x + DT / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
 
 
-def information_rate(psi: ca.SX) -> ca.SX:
-    """Compute the contribution of one sample to the six entries of I.
-
-    Args:
-        psi: (4, 3) sensitivity of the state.
-
-    Returns:
-        Six entries.
-    """
-    gram = DT / SIGMA**2 * psi.T @ psi
-    entries = [gram[i, j] for i, j in ENTRIES]
-    return ca.vertcat(*entries)
-
-
 def smallest_eigenvalue(entries: ca.SX) -> ca.SX:
     """Compute the smallest eigenvalue of a symmetric 3x3 matrix in closed trigonometric form.
 
@@ -210,11 +156,11 @@ def smallest_eigenvalue(entries: ca.SX) -> ca.SX:
     return mean + 2 * radius * ca.cos(angle + 2 * np.pi / 3)
 
 
-@dataclass(frozen=True)
-class Stage:
+@functools.cache
+def stage() -> Any:
     """Functions of one control sample; z holds a state and its sensitivity columns.
 
-    Attributes:
+    Returns:
         step: (z, u, theta) to z after the sample.
         linear: (z, u, theta) to A = dz+/dz and B = dz+/du.
         curvature: (z, u, theta, costate) to the blocks zz, zu and uu of the Hessian of the product
@@ -224,23 +170,9 @@ class Stage:
         rate_hessian: Weights of the six entries to the Hessian of the weighted contribution by z.
         criterion: I to Q_p / lambda_min, its gradient and its Hessian.
     """
-
-    step: ca.Function
-    linear: ca.Function
-    curvature: ca.Function
-    rate: ca.Function
-    rate_jacobian: ca.Function
-    rate_hessian: ca.Function
-    criterion: ca.Function
-
-
-@functools.cache
-def stage() -> Stage:
-    """Build the functions of one sample."""
     z = ca.SX.sym("z", NZ)
     u = ca.SX.sym("u")
     theta = ca.SX.sym("theta", NP)
-    inputs = [z, u, theta]
 
     # State and sensitivity after the sample, and their derivatives.
     x = z[:NX]
@@ -248,135 +180,59 @@ def stage() -> Stage:
     after = rk4(x, u, theta)
     psi_after = ca.jacobian(after, x) @ psi + ca.jacobian(after, theta)
     z_after = ca.vertcat(after, ca.vec(psi_after))
-    slopes = [ca.jacobian(z_after, z), ca.jacobian(z_after, u)]
 
     costate = ca.SX.sym("costate", NZ)
     second = ca.hessian(ca.dot(costate, z_after), ca.vertcat(z, u))[0]
-    blocks = [second[:NZ, :NZ], second[:NZ, NZ], second[NZ, NZ]]
 
     # Contribution of the sample to the information.
-    rate = information_rate(psi)
+    gram = DT / SIGMA**2 * psi.T @ psi
+    rate = ca.vertcat(*(gram[i, j] for i, j in ENTRIES))
     weights = ca.SX.sym("weights", 6)
-    rate_hessian = ca.hessian(ca.dot(weights, rate), z)[0]
 
     # Criterion of the information.
     info = ca.SX.sym("info", 6)
     value = Q_P / smallest_eigenvalue(info)
     value_hessian, value_gradient = ca.hessian(value, info)
 
-    return Stage(
-        step=ca.Function("step", inputs, [z_after]),
-        linear=ca.Function("linear", inputs, slopes),
-        curvature=ca.Function("curvature", [*inputs, costate], blocks),
-        rate=ca.Function("rate", [z], [rate]),
-        rate_jacobian=ca.Function("rate_jacobian", [z], [ca.jacobian(rate, z)]),
-        rate_hessian=ca.Function("rate_hessian", [weights], [rate_hessian]),
-        criterion=ca.Function("criterion", [info], [value, value_gradient, value_hessian]),
-    )
+    inputs = [z, u, theta]
+    slopes = [ca.jacobian(z_after, z), ca.jacobian(z_after, u)]
+    blocks = [second[:NZ, :NZ], second[:NZ, NZ], second[NZ, NZ]]
+    functions = {
+        "step": (inputs, [z_after]),
+        "linear": (inputs, slopes),
+        "curvature": ([*inputs, costate], blocks),
+        "rate": ([z], [rate]),
+        "rate_jacobian": ([z], [ca.jacobian(rate, z)]),
+        "rate_hessian": ([weights], [ca.hessian(ca.dot(weights, rate), z)[0]]),
+        "criterion": ([info], [value, value_gradient, value_hessian]),
+    }
+    return SimpleNamespace(**{key: ca.Function(key, *each) for key, each in functions.items()})
 
 
-@dataclass(frozen=True)
-class Rollout:
-    """Symbols of the functions over all samples.
-
-    Attributes:
-        u: (N,) controls.
-        p: Inputs theta, r_tau, q_slide and s^d at samples 1..N.
-        z: (16, N) states and sensitivities after each sample.
-        info: Six entries of I.
-        objective: J.
-    """
-
-    u: ca.MX
-    p: ca.MX
-    z: ca.MX
-    info: ca.MX
-    objective: ca.MX
-
-
-def start_of_sweep() -> ca.DM:
-    """Return the initial state with sensitivities of zero: (16,)."""
-    return ca.DM([*X0, *([0.0] * (NZ - NX))])
-
-
-def rollout() -> Rollout:
-    """Build the symbolic objective as a function of all controls."""
-    u = ca.MX.sym("u", N)
-    p = ca.MX.sym("p", NP + 2 + N)
-    theta = p[:NP]
-    control_weight = p[NP]
-    slide_weight = p[NP + 1]
-    planned_slide = p[NP + 2 :]
-
-    parts = stage()
-    z = parts.step.mapaccum(N)(start_of_sweep(), u.T, ca.repmat(theta, 1, N))
-    info = ca.sum2(parts.rate.map(N)(z))
-
-    slide_error = z[0, :].T - planned_slide
-    squares = control_weight * ca.sumsqr(u) + slide_weight * ca.sumsqr(slide_error)
-    running = DT / 2 * squares
-    return Rollout(u=u, p=p, z=z, info=info, objective=parts.criterion(info)[0] + running)
-
-
-@dataclass(frozen=True)
-class Slopes:
-    """First and second derivatives of a Lagrangian L(I, s_1..s_N, u).
-
-    The Lagrangian is a sum over samples except for its dependence on I.
-
-    Attributes:
-        info: (6,) dL/dI.
-        info_bend: (6, 6) d2L/dI2.
-        slide: (samples,) dL/ds at samples 1..N.
-        slide_bend: d2L/ds2, equal at all samples.
-        control_bend: d2L/du2, equal at all samples.
-    """
-
-    info: ca.MX
-    info_bend: ca.MX
-    slide: ca.MX
-    slide_bend: ca.MX
-    control_bend: ca.MX
-
-
-def slopes_of(roll: Rollout) -> Slopes:
-    """Build the derivatives of J."""
-    _, slope, bend = stage().criterion(roll.info)
-    control_bend = DT * roll.p[NP]
-    slide_bend = DT * roll.p[NP + 1]
-    slide_error = roll.z[0, :].T - roll.p[NP + 2 :]
-
-    return Slopes(
-        info=slope,
-        info_bend=bend,
-        slide=slide_bend * slide_error,
-        slide_bend=slide_bend,
-        control_bend=control_bend,
-    )
-
-
-def condensed_hessian(u: ca.MX, theta: ca.MX, z: ca.MX, slopes: Slopes, parts: Stage) -> ca.MX:
-    """Build the Hessian d2L/du2 by one backward sweep.
+def condensed_hessian(u: ca.MX, p: ca.MX, z: ca.MX, info: ca.MX, parts: Any) -> Any:
+    """Build the Hessian d2J/du2 by one backward sweep.
 
     The sweep carries, at each sample, the adjoints of the six information entries and of the slide
-    cost, the curvature P of the cost to come, and the columns W = d2L/(dz du_j) of all later
+    cost, the curvature P of the cost to come, and the columns W = d2J/(dz du_j) of all later
     controls. Since 1/lambda_min is no sum over samples, its curvature enters at the end through
     dI/du.
 
     Args:
-        u: (samples,) controls.
-        theta: Parameters.
-        z: (16, samples) states and sensitivities after each sample.
-        slopes: Derivatives of the Lagrangian.
+        u: (N,) controls.
+        p: Inputs of `problem`.
+        z: (16, N) states and sensitivities after each sample.
+        info: Six entries of I.
         parts: Functions of one sample.
 
     Returns:
-        Upper triangle of the Hessian: (samples, samples).
+        Upper triangle of the Hessian: (N, N).
     """
-    samples = u.shape[0]
-    before = ca.horzsplit(ca.horzcat(start_of_sweep(), z))
+    theta, control_bend, slide_bend = p[:NP], DT * p[NP], DT * p[NP + 1]
+    slide_slope = slide_bend * (z[0, :].T - p[NP + 2 :])
+    _, info_slope, info_bend = parts.criterion(info)
+    before = ca.horzsplit(ca.horzcat(START, z))
     slide = ca.DM.eye(NZ)[:, 0]
-    rate_hessian = parts.rate_hessian(slopes.info)
+    rate_hessian = parts.rate_hessian(info_slope)
 
     adjoint = ca.MX.zeros(NZ, 6)
     slide_adjoint = ca.MX.zeros(NZ)
@@ -385,18 +241,18 @@ def condensed_hessian(u: ca.MX, theta: ca.MX, z: ca.MX, slopes: Slopes, parts: S
     rows = []
     info_slopes = []
 
-    for k in reversed(range(samples)):
+    for k in reversed(range(N)):
         # Add the terms of the state after the sample.
         adjoint += parts.rate_jacobian(before[k + 1]).T
-        slide_adjoint += slide * slopes.slide[k]
-        curve += rate_hessian + slopes.slide_bend * slide @ slide.T
+        slide_adjoint += slide * slide_slope[k]
+        curve += rate_hessian + slide_bend * slide @ slide.T
 
         # Row of the Hessian.
         a, b = parts.linear(before[k], u[k], theta)
-        costate = adjoint @ slopes.info + slide_adjoint
+        costate = adjoint @ info_slope + slide_adjoint
         h_zz, h_zu, h_uu = parts.curvature(before[k], u[k], theta, costate)
         curve_b = curve @ b
-        diagonal = h_uu + slopes.control_bend + b.T @ curve_b
+        diagonal = h_uu + control_bend + b.T @ curve_b
         rows.append(ca.horzcat(ca.MX(1, k), diagonal, b.T @ columns))
         info_slopes.append(b.T @ adjoint)
 
@@ -407,75 +263,42 @@ def condensed_hessian(u: ca.MX, theta: ca.MX, z: ca.MX, slopes: Slopes, parts: S
         slide_adjoint = a.T @ slide_adjoint
 
     info_by_u = ca.vertcat(*reversed(info_slopes))
-    along_info = info_by_u @ slopes.info_bend @ info_by_u.T
-    return ca.triu(ca.vertcat(*reversed(rows)) + along_info)
+    return ca.triu(ca.vertcat(*reversed(rows)) + info_by_u @ info_bend @ info_by_u.T)
 
 
-@dataclass(frozen=True)
-class Problem:
-    """Functions of (u, p) over all samples, ready to evaluate.
+@functools.cache
+def problem(use_c: bool = True) -> Any:
+    """Build functions over all samples once per process; without a C compiler `use_c` is ignored.
 
-    Attributes:
-        value: J and the entries of I.
+    Only the two large functions of one sample become C. The sweep of the Hessian around them
+    consists of matrix products that CasADi's virtual machine runs as fast; unrolled over the
+    horizon, it would take over a minute to compile.
+
+    Returns:
+        value: J and the entries of I by the controls u: (N,) and the inputs p: theta, r_tau,
+            q_slide and s^d at samples 1..N.
         gradient: J and dJ/du.
         hessian: Multiplier of J times the upper triangle of d2J/du2, with the arguments of IPOPT.
         compiled: Whether the functions are compiled C.
         build_seconds: Time to build them [s].
     """
-
-    value: ca.Function
-    gradient: ca.Function
-    hessian: ca.Function
-    compiled: bool
-    build_seconds: float
-
-
-def compile_c(functions: list[ca.Function], folder: str) -> list[ca.Function]:
-    """Compile functions to machine code.
-
-    Args:
-        functions: Functions of CasADi.
-        folder: Folder for source and library, which must exist until the functions are loaded.
-
-    Returns:
-        Compiled functions in the order of the arguments.
-    """
-    generator = ca.CodeGenerator("peer.c")
-    for function in functions:
-        generator.add(function)
-    source = generator.generate(folder + os.sep)
-    library = os.path.join(folder, "peer.so")
-
-    compiler = shutil.which(os.environ.get("CC", "gcc")) or "cc"
-    options = ["-O3", "-march=native", "-fPIC", "-shared"]
-    subprocess.run([compiler, *options, source, "-o", library], check=True)
-    return [ca.external(function.name(), library) for function in functions]
-
-
-@functools.cache
-def problem(use_c: bool = True) -> Problem:
-    """Build the functions once per process; without a C compiler `use_c` has no effect.
-
-    Only the two large functions of one sample become C. The sweep of the Hessian around them
-    consists of matrix products that CasADi's virtual machine runs as fast; unrolled over the
-    horizon, it would take over a minute to compile.
-    """
     begin = time.perf_counter()
-    parts = stage()
-    roll = rollout()
-
-    variables = [roll.u, roll.p]
-    slope = ca.gradient(roll.objective, roll.u)
-    value = ca.Function("value", variables, [roll.objective, roll.info])
-    gradient = ca.Function("gradient", variables, [roll.objective, slope])
+    parts = SimpleNamespace(**vars(stage()))
+    u = ca.MX.sym("u", N)
+    p = ca.MX.sym("p", NP + 2 + N)
+    z = parts.step.mapaccum(N)(START, u.T, ca.repmat(p[:NP], 1, N))
+    info = ca.sum2(parts.rate.map(N)(z))
+    slide_error = z[0, :].T - p[NP + 2 :]
+    squares = p[NP] * ca.sumsqr(u) + p[NP + 1] * ca.sumsqr(slide_error)
+    J = parts.criterion(info)[0] + DT / 2 * squares
+    value = ca.Function("value", [u, p], [J, info])
+    gradient = ca.Function("gradient", [u, p], [J, ca.gradient(J, u)])
 
     compiled = False
     if use_c:
         try:
-            with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
-                blocks = [value, gradient, parts.linear, parts.curvature]
-                value, gradient, linear, curvature = compile_c(blocks, folder)
-            parts = replace(parts, linear=linear, curvature=curvature)
+            blocks = [value, gradient, parts.linear, parts.curvature]
+            value, gradient, parts.linear, parts.curvature = compile_c(blocks)
             compiled = True
         except (OSError, subprocess.CalledProcessError) as error:
             message = f"casadi_peer: no C compiler ({error}); using CasADi's virtual machine"
@@ -484,52 +307,46 @@ def problem(use_c: bool = True) -> Problem:
     # IPOPT also passes the multipliers of the constraints, which do not exist here.
     factor = ca.MX.sym("factor")
     no_constraints = ca.MX.sym("lam_g", 0)
-    triangle = factor * condensed_hessian(roll.u, roll.p[:NP], roll.z, slopes_of(roll), parts)
-    hessian = ca.Function("hessian", [*variables, factor, no_constraints], [triangle])
-
-    return Problem(
+    triangle = factor * condensed_hessian(u, p, z, info, parts)
+    return SimpleNamespace(
         value=value,
         gradient=gradient,
-        hessian=hessian,
+        hessian=ca.Function("hessian", [u, p, factor, no_constraints], [triangle]),
         compiled=compiled,
         build_seconds=time.perf_counter() - begin,
     )
 
 
+def compile_c(functions: list[ca.Function]) -> list[ca.Function]:
+    """Compile functions to machine code, in the order of the argument."""
+    generator = ca.CodeGenerator("peer.c")
+    for function in functions:
+        generator.add(function)
+    compiler = shutil.which(os.environ.get("CC", "gcc")) or "cc"
+    options = ["-O3", "-march=native", "-fPIC", "-shared"]
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
+        library = os.path.join(folder, "peer.so")
+        source = generator.generate(folder + os.sep)
+        subprocess.run([compiler, *options, source, "-o", library], check=True)
+        return [ca.external(function.name(), library) for function in functions]
+
+
 def parameters(case: Case) -> Array:
     """Compute the inputs p = (theta, r_tau, q_slide, s^d) of a case.
 
-    The plan s^d [m] is the position of the cart under u_ref at the parameters of the case.
+    The plan s^d [m] is the position of the cart under u_ref.
     """
-    x = ca.SX.sym("x", NX)
-    u = ca.SX.sym("u")
-    theta = ca.SX.sym("theta", NP)
-    step = ca.Function("plain_step", [x, u, theta], [rk4(x, u, theta)])
-
     control = ca.DM(reference_control()).T
-    thetas = ca.repmat(ca.DM(case.theta), 1, N)
-    states = step.mapaccum(N)(ca.DM(X0), control, thetas)
-    return np.concatenate([case.theta, [case.r_tau, case.q_slide], states.full()[0]])
+    states = stage().step.mapaccum(N)(START, control, ca.repmat(ca.DM(ACTUAL), 1, N))
+    return np.concatenate([ACTUAL, case, states.full()[0]])
 
 
 def objective(case: Case, u: Array, use_c: bool = True) -> tuple[float, Array]:
-    """Evaluate a control.
-
-    Args:
-        case: Row of the study.
-        u: (400,) control [N].
-        use_c: Whether compiled functions are used.
-
-    Returns:
-        J and the eigenvalues of I, ascending.
-    """
+    """J and the eigenvalues of I, ascending, of a control u: (400,) [N]."""
     j, entries = problem(use_c).value(u, parameters(case))
-
     info = np.empty((NP, NP))
     for value, (row, column) in zip(entries.full().ravel(), ENTRIES, strict=True):
-        info[row, column] = value
-        info[column, row] = value
-
+        info[row, column] = info[column, row] = value
     return float(j), np.asarray(np.linalg.eigvalsh(info), dtype=float)
 
 
@@ -557,39 +374,55 @@ class Recorder:
 
 
 class IterateWatch(ca.Callback):
-    """Iteration callback of IPOPT that records J of every accepted iterate."""
+    """Iteration callback of IPOPT that records J of every accepted iterate.
+
+    Its inputs are the results of CasADi's solver: x, f, g, lam_x, lam_g and lam_p.
+    """
 
     def __init__(self) -> None:
         """Register with CasADi for a problem without constraints."""
         super().__init__()
         self.recorder = Recorder()
-        self.rows = {"f": 1, "x": N, "lam_x": N, "lam_p": NP + 2 + N, "g": 0, "lam_g": 0}
+        self.rows = (N, 1, 0, N, 0, NP + 2 + N)
         self.construct("iterate_watch", {})
 
     def get_n_in(self) -> int:
-        """Return the number of outputs that the solver passes on."""
-        return int(ca.nlpsol_n_out())
-
-    def get_n_out(self) -> int:
-        """Return the number of results: the stop flag."""
-        return 1
-
-    def get_name_in(self, i: int) -> str:
-        """Return the name of solver output i."""
-        return str(ca.nlpsol_out(i))
+        return len(self.rows)
 
     def get_sparsity_in(self, i: int) -> ca.Sparsity:
-        """Return the shape of solver output i."""
-        return ca.Sparsity.dense(self.rows[ca.nlpsol_out(i)], 1)
+        return ca.Sparsity.dense(self.rows[i], 1)
 
     def eval(self, arg: Sequence[ca.DM]) -> list[int]:
         """Record J and let the solver continue."""
-        self.recorder.note(float(arg[ca.nlpsol_out().index("f")]))
+        self.recorder.note(float(arg[1]))
         return [0]
 
 
-def ipopt_solver(case: Case, functions: Problem, watch: IterateWatch) -> ca.Function:
-    """Build IPOPT over the controls; J is scaled so that the weight of the control is one."""
+def outcome(case: Case, u: Array, use_c: bool, recorder: Recorder, **found: Any) -> Any:
+    """The outcome of a solver at its end.
+
+    Returns:
+        J: Cost of the solution.
+        history: Time since the start of the solver [s] and lowest J up to then.
+        seconds: Time of the solver alone [s].
+        The values of `found`: name of the solver, number of iterations, and time before the first
+            iterate [s].
+    """
+    seconds = recorder.seconds()
+    J, _ = objective(case, u, use_c)
+    return SimpleNamespace(J=J, seconds=seconds, history=recorder.history, **found)
+
+
+def ipopt(case: Case, use_c: bool = True) -> Any:
+    """Solve by IPOPT from u_ref with the exact Hessian of single shooting.
+
+    J is scaled so that the weight of the control is one.
+    """
+    functions = problem(use_c)
+
+    setup = Recorder()
+    start = parameters(case)
+    watch = IterateWatch()
     u = ca.MX.sym("u", N)
     p = ca.MX.sym("p", NP + 2 + N)
     options: dict[str, Any] = {
@@ -604,53 +437,33 @@ def ipopt_solver(case: Case, functions: Problem, watch: IterateWatch) -> ca.Func
         "ipopt.max_iter": 500,
         "ipopt.tol": 1e-7,
         "ipopt.nlp_scaling_method": "none",
-        "ipopt.obj_scaling_factor": 1 / (case.r_tau * DT),
+        "ipopt.obj_scaling_factor": 1 / (case[0] * DT),
     }
-    problem_symbols: dict[str, Any] = {"x": u, "p": p, "f": functions.value(u, p)[0]}
-    return ca.nlpsol("peer", "ipopt", problem_symbols, options)
-
-
-def ipopt(case: Case, use_c: bool = True) -> PeerRun:
-    """Solve by IPOPT from u_ref with the exact Hessian of single shooting."""
-    functions = problem(use_c)
-
-    setup = Recorder()
-    p = parameters(case)
-    watch = IterateWatch()
-    solver = ipopt_solver(case, functions, watch)
-    setup_seconds = setup.seconds()
+    symbols: dict[str, Any] = {"x": u, "p": p, "f": functions.value(u, p)[0]}
+    solver = ca.nlpsol("peer", "ipopt", symbols, options)
+    prepared = setup.seconds()
 
     watch.recorder.begin = time.perf_counter()
-    solution = solver(x0=reference_control(), p=p)
-    seconds = watch.recorder.seconds()
-
-    j, _ = objective(case, solution["x"].full().ravel(), use_c)
-    return PeerRun(
+    solution = solver(x0=reference_control(), p=start)
+    return outcome(
+        case,
+        solution["x"].full().ravel(),
+        use_c,
+        watch.recorder,
         name="CasADi + IPOPT",
-        case=case.name,
-        J=j,
         iterations=int(solver.stats()["iter_count"]),
-        seconds=seconds,
-        setup_seconds=setup_seconds,
-        history=tuple(watch.recorder.history),
+        prepared=prepared,
     )
 
 
-def lbfgs(case: Case, use_c: bool = True) -> PeerRun:
+def lbfgs(case: Case, use_c: bool = True) -> Any:
     """Solve by SciPy's L-BFGS-B from u_ref, on J / (R dt)."""
     functions = problem(use_c)
 
     setup = Recorder()
     p = parameters(case)
-    scale = 1 / (case.r_tau * DT)
-    options = {
-        "maxcor": MEMORY,
-        "maxiter": 2000,
-        "maxfun": 4000,
-        "ftol": 1e-12,
-        "gtol": 1e-5,
-    }
-    setup_seconds = setup.seconds()
+    scale = 1 / (case[0] * DT)
+    prepared = setup.seconds()
 
     recorder = Recorder()
 
@@ -660,15 +473,8 @@ def lbfgs(case: Case, use_c: bool = True) -> PeerRun:
         recorder.note(float(j))
         return scale * float(j), scale * slope.full().ravel()
 
+    options = {"maxcor": MEMORY, "maxiter": 2000, "maxfun": 4000, "ftol": 1e-12, "gtol": 1e-5}
     result = minimize(scaled, reference_control(), jac=True, method="L-BFGS-B", options=options)
-    seconds = recorder.seconds()
-    j, _ = objective(case, result.x, use_c)
-    return PeerRun(
-        name="CasADi + L-BFGS",
-        case=case.name,
-        J=j,
-        iterations=int(result.nit),
-        seconds=seconds,
-        setup_seconds=setup_seconds,
-        history=tuple(recorder.history),
-    )
+    name, iterations = "CasADi + L-BFGS", int(result.nit)
+    found = {"name": name, "iterations": iterations, "prepared": prepared}
+    return outcome(case, result.x, use_c, recorder, **found)

@@ -5,16 +5,15 @@
 Each set is fitted from some of its recordings and predicts the others, as the experiment in
 `models/` states it and with terms that `identify --select` adds. The guess is what the authors of
 the data published. The script prints the chosen terms, the error of the prediction over that of the
-published parameters, the mean half width of the 95 % intervals, the reasons of a misfit, seconds
-and simulations of all data. The recordings are not part of the repository; where they come from is
-in docs/benchmarks.md.
+published parameters, the mean half width of the 95 % intervals, the reasons of a misfit, and the
+seconds. The recordings are not part of the repository.
 """
 
 from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Sequence
 from dataclasses import field
 from pathlib import Path
 
@@ -24,10 +23,8 @@ from rich.console import Console
 import mjfim
 from mjfim.arrays import record
 from mjfim.experiment.system import System
-from mjfim.identification.identify import identify_system
 from mjfim.recordings.read import read_recording
-from mjfim.records.estimate import Estimate
-from scripts.benchmarks.child import ROOT, new_table, options_of
+from scripts.benchmarks.child import ROOT, SHARED, new_table, options_of
 
 # Constants of the servo as published: kt [N m/A], R [Ohm].
 SERVO_KT = 0.32321
@@ -44,7 +41,6 @@ class MeasuredSet:
         fitted: Files that are fitted.
         held_out: Files that are predicted.
         published: Published values of parameters [theta-unit].
-        selects: Whether terms are selected as well.
     """
 
     name: str
@@ -52,7 +48,17 @@ class MeasuredSet:
     fitted: tuple[str, ...]
     held_out: tuple[str, ...]
     published: dict[str, float] = field(default_factory=dict)
-    selects: bool = True
+
+    def experiment(self) -> mjfim.Experiment:
+        """The experiment of `models/`, whose guess is what was published."""
+        guesses = {name: {"guess": value} for name, value in self.published.items()}
+        file = ROOT / "models" / f"{self.name}.toml"
+        return mjfim.Experiment.from_file(file).replace(parameters=guesses)
+
+    def read(self, data: Path, names: Sequence[str]) -> list[mjfim.Recording]:
+        """Read some recordings below the folder of all data."""
+        channels = System.resolve(self.experiment()).channels
+        return [read_recording(data / self.folder / name, channels) for name in names]
 
 
 # Times of the logs of the servo, in their order.
@@ -100,107 +106,57 @@ SETS = (
             "mounting": 0.0179525,
         },
     ),
-    # All logs of the servo, of which each part is predicted from the others. The guess is that of
-    # the experiment.
-    MeasuredSet(
-        name="bam_xl330",
-        folder="bam_xl330/raw",
-        fitted=servo_files(*SERVO_TIMES),
-        held_out=(),
-        selects=False,
-    ),
 )
 
 
-@record
-class Result:
-    """Result of one identification of a set.
-
-    Attributes:
-        found: The estimate.
-        passes: Simulations of all fitted data.
-        seconds: Time [s].
-    """
-
-    found: Estimate
-    passes: float
-    seconds: float
-
-
-def identified(data: Path, measured: MeasuredSet, is_selecting: bool) -> Result:
-    """Identify a set.
+def identified(data: Path, measured: MeasuredSet, is_selecting: bool) -> list[str]:
+    """Identify a set, and return the cells of its result.
 
     Args:
         data: Folder of all data.
         measured: The set.
         is_selecting: Whether terms are selected.
-
-    Returns:
-        The result.
     """
-    experiment = mjfim.Experiment.from_file(ROOT / "models" / f"{measured.name}.toml").replace(
-        parameters={name: {"guess": value} for name, value in measured.published.items()}
-    )
-    system = System.resolve(experiment)
-    read: Callable[[str], mjfim.Recording] = lambda name: read_recording(  # noqa: E731
-        data / measured.folder / name, system.channels
-    )
-    fitted = [read(name) for name in measured.fitted]
-    held_out = [read(name) for name in measured.held_out]
-
+    fit = mjfim.select_terms if is_selecting else mjfim.identify
+    names = (measured.fitted, measured.held_out)
+    fitted, held_out = (measured.read(data, each) for each in names)
     begun = time.perf_counter()
-    if is_selecting:
-        found = mjfim.select_terms(experiment, fitted, held_out=held_out)
-    else:
-        found = identify_system(system, fitted, held_out=held_out)
+    found = fit(measured.experiment(), fitted, held_out=held_out)
     seconds = time.perf_counter() - begun
 
-    timestep = float(system.model.opt.timestep)
-    steps = sum((recording.t[-1] - recording.t[0]) / timestep for recording in fitted)
-    return Result(found=found, passes=found.steps / steps, seconds=seconds)
-
-
-def _changes(found: Estimate) -> list[str]:
-    """Terms that a selection added, and parameters that it pooled or held, in words."""
+    changes = []
     selection = found.selection
-    if selection is None:
-        return []
-    words = [term.description for term in selection.terms]
-    words += [f"one {pool.name}" for pool in selection.pooled]
-    return words + [f"{name} held at its guess" for name in selection.held]
-
-
-def row_of(measured: MeasuredSet, result: Result, is_selecting: bool) -> list[str]:
-    """Cells of a result."""
-    found = result.found
-    ratios = [prediction.ratio for prediction in found.predictions if prediction.held_out]
+    if selection is not None:
+        print(measured.name, selection, flush=True)
+        changes = [term.description for term in selection.terms]
+        changes += [f"one {pool.name}" for pool in selection.pooled]
+        changes += [f"{name} held at its guess" for name in selection.held]
 
     # A parameter that is held at its guess has no interval.
     halves = 0.5 * np.ptp(found.interval, axis=1) / np.maximum(np.abs(found.theta), 1e-300)
     halves = halves[[name not in found.held for name in found.parameters]]
-    reasons = "; ".join(found.reasons) if found.misfit else "none"
-    logs = f"{measured.name}, {len(measured.fitted)} fitted, {len(measured.held_out)} predicted"
+    ratios = [prediction.ratio for prediction in found.predictions if prediction.held_out]
+    logs = f"{measured.name}, {len(fitted)} fitted, {len(held_out)} predicted"
     return [
         logs if not is_selecting else "",
         "--select" if is_selecting else "as stated",
-        ", ".join(_changes(found)) or "–",
-        ", ".join(f"{ratio:.3g}" for ratio in ratios) or "–",
+        ", ".join(changes) or "–",
+        ", ".join(f"{ratio:.3g}" for ratio in ratios),
         f"{100.0 * float(np.median(halves)):.1f} %",
-        reasons,
-        f"{result.seconds:.0f}",
-        f"{result.passes:.0f}",
+        "; ".join(found.reasons) if found.misfit else "none",
+        f"{seconds:.0f}",
     ]
 
 
 def main() -> int:
     """Identify every set with and without selection, and print what was found."""
     parser = options_of(__doc__)
-    parser.add_argument("--data", type=Path, default=ROOT.parent / "shared" / "data")
+    parser.add_argument("--data", type=Path, default=SHARED / "data")
     parser.add_argument("--only", choices=sorted({each.name for each in SETS}), help="one robot")
     args = parser.parse_args()
 
     headings = "set, identified, what changed, held-out / published, median interval, misfit"
-    headings = f"{headings}, seconds, passes"
+    headings = f"{headings}, seconds"
     table = new_table("Measured data of other groups", *headings.split(", "), texts=3)
     for measured in SETS:
         if args.only not in (None, measured.name):
@@ -208,15 +164,12 @@ def main() -> int:
         if not (args.data / measured.folder).is_dir():
             print(f"skipped: {args.data / measured.folder} is not there", file=sys.stderr)
             continue
-        for is_selecting in (False, True) if measured.selects else (False,):
-            result = identified(args.data, measured, is_selecting)
-            row = row_of(measured, result, is_selecting)
+        for is_selecting in (False, True):
+            row = identified(args.data, measured, is_selecting)
             table.add_row(*row)
 
             # Each row is shown at once as well, because all of them take minutes.
             print(" | ".join(row), file=sys.stderr)
-            if result.found.selection is not None:
-                print(measured.name, result.found.selection, flush=True)
 
     Console(width=200).print(table)
     return 0
