@@ -13,7 +13,6 @@ computer.
 
 from __future__ import annotations
 
-import argparse
 import csv
 import gzip
 import json
@@ -35,9 +34,10 @@ import tomlkit
 from PIL import Image
 
 from mjfim.output.plots.pictures import kind_of_picture
+from scripts.benchmarks.child import ROOT, SHARED, options_of
+from scripts.benchmarks.so101 import JOINTS, read_motion
 from scripts.verbs import call_verb
 
-ROOT = Path(__file__).resolve().parent.parent
 PAGE = ROOT / "docs" / "gallery.md"
 
 # Columns of the terminal, and longest time of one verb [s].
@@ -49,16 +49,7 @@ PAGE_WIDTH, PAGE_COLOURS = 1000, 64
 # Relative difference of the simulated robots from their models.
 ROBOT_DIFFERENCE = 0.1
 
-# Joints of the SO-101, in the order of its logs, and number of rows of a log that are fitted, 50 a
-# second.
-JOINTS = (
-    "shoulder_pan",
-    "shoulder_lift",
-    "elbow_flex",
-    "wrist_flex",
-    "wrist_roll",
-    "gripper",
-)
+# Number of rows of a log of the SO-101 that are fitted, 50 a second.
 LOG_ROWS = 500
 
 # What the pictures of the page show, by their names, in the order of the page.
@@ -93,20 +84,6 @@ TOLERANCE, LAST_DIGIT = 0.01, 1.001
 
 
 @dataclass(frozen=True, kw_only=True)
-class Step:
-    """One call of the command line.
-
-    Attributes:
-        words: The verb and its arguments; `{experiment}`, the experiment with the `{robot}`'s
-            values, and the folder `{out}` are filled in.
-        is_quick: Whether it takes so little time that `--check` makes the call again.
-    """
-
-    words: str
-    is_quick: bool = False
-
-
-@dataclass(frozen=True, kw_only=True)
 class Robot:
     """A robot of the gallery.
 
@@ -114,7 +91,9 @@ class Robot:
         title: Title on the page.
         text: What is shown.
         source: Experiment file, or the model for which `mjfim init` writes one.
-        steps: Calls of the command line.
+        steps: Calls of the command line: the verb and its arguments. `{experiment}`, the experiment
+            with the `{robot}`'s values, and the folder `{out}` are filled in.
+        quick: Number of the first calls that take so little time that `--check` makes them again.
         iterations: Number of iterations of a design for an experiment of `init`; 0 for none.
         log: Folder of a measured log, which the calls find as `{out}/log.csv`; empty for none.
     """
@@ -122,7 +101,8 @@ class Robot:
     title: str
     text: str
     source: str
-    steps: tuple[Step, ...]
+    steps: tuple[str, ...]
+    quick: int = 1
     iterations: int = 0
     log: str = ""
 
@@ -154,13 +134,12 @@ class Shown:
         return self.command.split()[1]
 
 
-CHECK = Step(words="check {experiment} -o {out}/check", is_quick=True)
-DESIGN = Step(words="design {experiment} -o {out}/design")
-RECORDING = (
-    Step(words="simulate {robot} {out}/design -o {out}/log.csv"),
-    Step(words="identify {experiment} {out}/log.csv --predicted {out}/design -o {out}/identify"),
+STEPS = (
+    "check {experiment} -o {out}/check",
+    "design {experiment} -o {out}/design",
+    "simulate {robot} {out}/design -o {out}/log.csv",
+    "identify {experiment} {out}/log.csv --predicted {out}/design -o {out}/identify",
 )
-
 
 ROBOTS = (
     Robot(
@@ -168,33 +147,33 @@ ROBOTS = (
         text="The study of the paper, without limits.",
         source="models/cart_pendulum.toml",
         steps=(
-            CHECK,
-            Step(words=DESIGN.words, is_quick=True),
-            *(Step(words=step.words, is_quick=True) for step in RECORDING),
-            Step(words="montecarlo {experiment} {out}/design -o {out}/montecarlo"),
-            Step(words="compare {experiment} --seconds 5 -o {out}/compare"),
-            Step(words="campaign {experiment} --wanted 0.005 --rounds 3 -o {out}/campaign"),
+            *STEPS,
+            "montecarlo {experiment} {out}/design -o {out}/montecarlo",
+            "compare {experiment} --seconds 5 -o {out}/compare",
+            "campaign {experiment} --wanted 0.005 --rounds 3 -o {out}/campaign",
         ),
+        quick=len(STEPS),
     ),
     Robot(
         title="Servo arm",
         text="Four joints with position servos. The simulated robot is 10 % off the model.",
         source="models/servo_arm.toml",
-        steps=(CHECK, DESIGN, *RECORDING),
+        steps=STEPS,
     ),
     Robot(
         title="SO-101",
         text="The experiment of `mjfim init`, 10 iterations. The robot is 10 % off the model.",
         source="shared/models/so101/so101_nomesh.xml",
         iterations=10,
-        steps=(CHECK, DESIGN, *RECORDING),
+        steps=STEPS,
     ),
     Robot(
         title="Measured SO-101",
         text="A chirp of a real SO-101, and the published model.",
         source="shared/models/so101/so101_nomesh.xml",
         log="shared/data/sage_so101/chirp_sweep",
-        steps=(Step(words="identify {experiment} {out}/log.csv -o {out}/identify"),),
+        steps=("identify {experiment} {out}/log.csv -o {out}/identify",),
+        quick=0,
     ),
 )
 
@@ -213,7 +192,7 @@ def show_robot(robot: Robot, root: Path, *, is_quick: bool = False) -> Iterator[
     Yields:
         What each call left behind.
     """
-    steps = [step for step in robot.steps if step.is_quick or not is_quick]
+    steps = robot.steps[: robot.quick if is_quick else None]
     if not steps:
         return
     (root / robot.name).mkdir()
@@ -222,22 +201,18 @@ def show_robot(robot: Robot, root: Path, *, is_quick: bool = False) -> Iterator[
         experiment = f"{robot.name}/experiment.toml"
         yield _call(["init", robot.source, "-o", experiment], root)
         if robot.iterations:
-            _end_after(root / experiment, robot.iterations)
+            # A design ends after this number, whatever time it takes.
+            stated = tomlkit.parse((root / experiment).read_text(encoding="utf-8"))
+            descent: dict[str, Any] = stated.setdefault("descent", {})
+            descent.update(max_iterations=robot.iterations, seconds=PATIENCE)
+            (root / experiment).write_text(tomlkit.dumps(stated), encoding="utf-8")
     if robot.log:
         write_log(root / robot.log, root / robot.name / "log.csv")
     for step in steps:
         values = {"experiment": experiment, "out": robot.name}
-        if "{robot}" in step.words:
+        if "{robot}" in step:
             values["robot"] = simulated_robot(root, experiment, robot.name)
-        yield _call([word.format(**values) for word in step.words.split()], root)
-
-
-def _end_after(experiment: Path, count: int) -> None:
-    """State in an experiment after how many iterations a design ends, whatever time they take."""
-    stated = tomlkit.parse(experiment.read_text(encoding="utf-8"))
-    descent: dict[str, Any] = stated.setdefault("descent", {})
-    descent.update(max_iterations=count, seconds=PATIENCE)
-    experiment.write_text(tomlkit.dumps(stated), encoding="utf-8")
+        yield _call([word.format(**values) for word in step.split()], root)
 
 
 def simulated_robot(root: Path, experiment: str, out: str) -> str:
@@ -278,17 +253,11 @@ def write_log(source: Path, target: Path) -> None:
         source: Folder of the log, with a JSON array of all joints in each row.
         target: The CSV file.
     """
-    columns: dict[str, Any] = {}
-    for file, name in (("control", "ctrl"), ("state_motor", "qpos")):
-        with gzip.open(source / f"{file}.csv.gz", "rt", encoding="utf-8") as opened:
-            rows = list(csv.DictReader(opened))[:LOG_ROWS]
-        columns["t"] = [
-            1e-6 * (float(row["timestamp"]) - float(rows[0]["timestamp"])) for row in rows
-        ]
-        angles = np.array([json.loads(row["positions"]) for row in rows])
-        columns |= {f"{name}:{joint}": angles[:, k] for k, joint in enumerate(JOINTS)}
-    table = np.column_stack(list(columns.values()))
-    np.savetxt(target, table, "%.6f", delimiter=",", header=",".join(columns), comments="")
+    with gzip.open(source / "state_motor.csv.gz", "rt", encoding="utf-8") as opened:
+        stamps = np.array([float(row["timestamp"]) for row in csv.DictReader(opened)])
+    table = np.column_stack([1e-6 * (stamps - stamps[0]), read_motion(source)])[:LOG_ROWS]
+    names = ["t", *(f"{kind}:{joint}" for kind in ("ctrl", "qpos") for joint in JOINTS)]
+    np.savetxt(target, table, "%.6f", delimiter=",", header=",".join(names), comments="")
 
 
 def _call(words: Sequence[str], root: Path) -> Shown:
@@ -415,10 +384,8 @@ def _is_same(old: str, new: str) -> bool:
 
 def main() -> int:
     """Make the gallery, or compare its numbers; exit code 1 if a call fails or they differ."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--shared", type=Path, default=ROOT.parent / "shared")
+    parser = options_of(__doc__)
+    parser.add_argument("--shared", type=Path, default=SHARED)
     parser.add_argument("--check", action="store_true", help="compare the numbers of the page")
     options = parser.parse_args()
 

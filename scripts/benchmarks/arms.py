@@ -25,20 +25,19 @@ and at least as large as that of every single parameter. The scale of a paramete
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import mujoco
 import numpy as np
 
-from mjfim.arrays import Array
+from mjfim.arrays import Array, record
 from mjfim.experiment.initial import multisine
 from mjfim.experiment.schema import Experiment
-from scripts.benchmarks.child import ROOT
+from scripts.benchmarks.child import SHARED
 
-# Folder of the models that others wrote, beside the repository.
-MODELS = ROOT.parent / "shared" / "models"
+# Timestep of the engine [s].
+TIMESTEP = 0.002
 
 # Rates of control updates and of measurements [Hz].
 RATE, MEASURED = 100.0, 50.0
@@ -64,44 +63,12 @@ FUNDAMENTAL = 0.2
 # Position in the frame of a body [m].
 Point = tuple[float, float, float]
 
-
-@dataclass(frozen=True)
-class Capsule:
-    """A capsule in place of a link.
-
-    Attributes:
-        body: Name of the body that carries the capsule.
-        start: Start of the axis in the frame of the body [m].
-        end: End of the axis in the frame of the body [m]; equal to the start for a sphere.
-        radius: Radius [m].
-    """
-
-    body: str
-    start: Point
-    end: Point
-    radius: float
+# A capsule in place of a link: body that carries it, ends of its axis (equal for a sphere), and
+# radius [m].
+Capsule = tuple[str, Point, Point, float]
 
 
-@dataclass(frozen=True)
-class Payload:
-    """A body that is welded to another.
-
-    Attributes:
-        parent: Name of the body that carries the payload.
-        mass: Mass [kg].
-        com: Centre of mass in the frame of the parent [m].
-        inertia: Principal moments of inertia [kg m²].
-        radius: Radius of the sphere that stands for the payload [m].
-    """
-
-    parent: str
-    mass: float
-    com: Point
-    inertia: Point
-    radius: float
-
-
-@dataclass(frozen=True)
+@record
 class Arm:
     """An arm, the additions to its MJCF, and its limits.
 
@@ -110,11 +77,14 @@ class Arm:
         joints: Names of the joints; each has an actuator of this name.
         home: Joint positions of the keyframe `home` [rad].
         capsules: Capsules in place of the links.
-        payload: Payload at the last link.
+        carrier: Name of the body that carries the payload.
+        mass: Mass of the payload [kg].
+        com: Its centre of mass in the frame of the carrier [m].
+        inertia: Its principal moments of inertia [kg m²].
+        radius: Radius of the sphere that stands for it [m].
         damping: Nominal damping of every joint [N m s/rad].
         armature: Nominal armature of every joint [kg m²].
         friction: Nominal dry friction of every joint [N m].
-        timestep: Timestep of the engine [s].
         overlapping: Pairs of bodies whose capsules always overlap.
         velocity: Limits of the joint velocities [rad/s], one for all or one for each joint.
         rate: Limits of the rate of the reference [rad/s], one for all or one for each joint.
@@ -126,11 +96,14 @@ class Arm:
     joints: tuple[str, ...]
     home: tuple[float, ...]
     capsules: tuple[Capsule, ...]
-    payload: Payload
+    carrier: str
+    mass: float
+    com: Point
+    inertia: Point
+    radius: float
     damping: float
     armature: float
     friction: float
-    timestep: float
     overlapping: tuple[tuple[str, str], ...]
     velocity: float | dict[str, float]
     rate: float | dict[str, float]
@@ -158,22 +131,25 @@ ARMS = {
         joints=PANDA,
         home=(0.0, 0.0, 0.0, -1.57079, 0.0, 1.57079, -0.7853),
         capsules=(
-            Capsule("link0", (-0.09, 0.0, 0.06), (0.01, 0.0, 0.06), 0.07),
-            Capsule("link1", (0.0, 0.0, -0.13), (0.0, 0.0, 0.0), 0.06),
-            Capsule("link2", (0.0, 0.0, -0.06), (0.0, 0.0, 0.06), 0.06),
-            Capsule("link3", (0.0, 0.0, -0.22), (0.0, 0.0, -0.07), 0.06),
-            Capsule("link4", (0.0, 0.0, -0.06), (0.0, 0.0, 0.06), 0.06),
-            Capsule("link5", (0.0, 0.0, -0.31), (0.0, 0.0, -0.21), 0.06),
-            Capsule("link5", (0.0, 0.08, -0.20), (0.0, 0.08, -0.06), 0.025),
-            Capsule("link6", (0.0, 0.0, -0.07), (0.0, 0.0, 0.01), 0.05),
-            Capsule("link7", (0.0, 0.0, -0.06), (0.0, 0.0, 0.08), 0.04),
-            Capsule("link7", (0.0389, 0.0389, 0.082), (0.046, 0.046, 0.082), 0.03),
+            ("link0", (-0.09, 0.0, 0.06), (0.01, 0.0, 0.06), 0.07),
+            ("link1", (0.0, 0.0, -0.13), (0.0, 0.0, 0.0), 0.06),
+            ("link2", (0.0, 0.0, -0.06), (0.0, 0.0, 0.06), 0.06),
+            ("link3", (0.0, 0.0, -0.22), (0.0, 0.0, -0.07), 0.06),
+            ("link4", (0.0, 0.0, -0.06), (0.0, 0.0, 0.06), 0.06),
+            ("link5", (0.0, 0.0, -0.31), (0.0, 0.0, -0.21), 0.06),
+            ("link5", (0.0, 0.08, -0.20), (0.0, 0.08, -0.06), 0.025),
+            ("link6", (0.0, 0.0, -0.07), (0.0, 0.0, 0.01), 0.05),
+            ("link7", (0.0, 0.0, -0.06), (0.0, 0.0, 0.08), 0.04),
+            ("link7", (0.0389, 0.0389, 0.082), (0.046, 0.046, 0.082), 0.03),
         ),
-        payload=Payload("attachment", 1.0, (0.03, -0.02, 0.06), (1.2e-3, 1.0e-3, 0.8e-3), 0.05),
+        carrier="attachment",
+        mass=1.0,
+        com=(0.03, -0.02, 0.06),
+        inertia=(1.2e-3, 1.0e-3, 0.8e-3),
+        radius=0.05,
         damping=1.0,
         armature=0.1,
         friction=0.5,
-        timestep=0.002,
         overlapping=(("link0", "link1"), ("link1", "link3")),
         velocity=PANDA_SPEED,
         rate=PANDA_SPEED,
@@ -188,19 +164,22 @@ ARMS = {
         joints=SO_ARM,
         home=(0.0, -1.57079, 1.57079, 1.57079, -1.57079, 0.5),
         capsules=(
-            Capsule("Base", (0.0, -0.045, 0.03), (0.0, 0.0, 0.03), 0.03),
-            Capsule("Rotation_Pitch", (0.0, 0.055, 0.0), (0.0, 0.1025, 0.0306), 0.03),
-            Capsule("Upper_Arm", (0.0, 0.0, 0.0), (0.0, 0.11257, 0.028), 0.03),
-            Capsule("Lower_Arm", (0.0, 0.0, 0.0), (0.0, 0.0052, 0.1349), 0.028),
-            Capsule("Wrist_Pitch_Roll", (0.0, 0.0, 0.0), (0.0, -0.05, 0.0), 0.025),
-            Capsule("Fixed_Jaw", (0.005, -0.035, 0.0), (0.012, -0.095, 0.0), 0.018),
-            Capsule("Moving_Jaw", (0.0, 0.0, 0.0), (-0.009, -0.075, 0.0), 0.012),
+            ("Base", (0.0, -0.045, 0.03), (0.0, 0.0, 0.03), 0.03),
+            ("Rotation_Pitch", (0.0, 0.055, 0.0), (0.0, 0.1025, 0.0306), 0.03),
+            ("Upper_Arm", (0.0, 0.0, 0.0), (0.0, 0.11257, 0.028), 0.03),
+            ("Lower_Arm", (0.0, 0.0, 0.0), (0.0, 0.0052, 0.1349), 0.028),
+            ("Wrist_Pitch_Roll", (0.0, 0.0, 0.0), (0.0, -0.05, 0.0), 0.025),
+            ("Fixed_Jaw", (0.005, -0.035, 0.0), (0.012, -0.095, 0.0), 0.018),
+            ("Moving_Jaw", (0.0, 0.0, 0.0), (-0.009, -0.075, 0.0), 0.012),
         ),
-        payload=Payload("Fixed_Jaw", 0.15, (0.035, -0.055, 0.015), (3.0e-5, 2.5e-5, 2.0e-5), 0.02),
+        carrier="Fixed_Jaw",
+        mass=0.15,
+        com=(0.035, -0.055, 0.015),
+        inertia=(3.0e-5, 2.5e-5, 2.0e-5),
+        radius=0.02,
         damping=0.6,
         armature=0.1,
         friction=0.1,
-        timestep=0.002,
         overlapping=(("Base", "Rotation_Pitch"), ("Wrist_Pitch_Roll", "Moving_Jaw")),
         velocity=4.0,
         rate=6.0,
@@ -210,105 +189,68 @@ ARMS = {
 }
 
 
-def model_file(arm: Arm, name: str, friction: bool, folder: Path) -> Path:
-    """Write the MJCF of an arm.
+def model_file(name: str, friction: bool, folder: Path) -> Path:
+    """Write the MJCF of an arm into a folder.
 
     Args:
-        arm: The arm.
-        name: Name of the arm, from which the name of the file is made.
+        name: Key of `ARMS`, from which the name of the file is made.
         friction: Whether the joints have dry friction.
         folder: Folder that receives the file.
-
-    Returns:
-        Path of the file.
     """
-    source = MODELS / arm.file
+    arm = ARMS[name]
+    source = SHARED / "models" / arm.file
     if not source.is_file():
         raise SystemExit(f"{source}: no such model; the arms are not part of this repository")
 
+    # Gains that follow a damping ratio would change with the payload.
     spec = mujoco.MjSpec.from_file(str(source))
-    _state_gains(spec, spec.compile())
-    spec.option.timestep = arm.timestep
+    model = spec.compile()
+    for actuator in spec.actuators:
+        actuator.biasprm[:] = model.actuator(actuator.name).biasprm
+    spec.option.timestep = TIMESTEP
 
     for joint in spec.joints:
         joint.damping[0] = arm.damping
         joint.armature = arm.armature
         joint.frictionloss = arm.friction if friction else 0.0
 
-    _add_bodies(spec, arm)
-
-    model = spec.compile()
-    key = spec.key("home")
-    key.qpos = list(arm.home)
-    key.ctrl = holding(model, np.array(arm.home)).tolist()
-
-    folder.mkdir(parents=True, exist_ok=True)
-    variant = "_dry" if friction else ""
-    path = folder / f"{name}{variant}.xml"
-    path.write_text(spec.to_xml(), encoding="utf-8")
-    return path
-
-
-def _state_gains(spec: Any, model: Any) -> None:
-    """Write the gains of the servos as they were compiled.
-
-    Gains that follow a damping ratio would change with the payload.
-    """
-    for actuator in spec.actuators:
-        actuator.biasprm[:] = model.actuator(actuator.name).biasprm
-
-
-def _add_bodies(spec: Any, arm: Arm) -> None:
-    """Add payload, floor and capsules; the capsules replace all geoms of the MJCF."""
+    # Payload, floor and capsules replace all geoms of the MJCF.
     for geom in list(spec.geoms):
         spec.delete(geom)
-
-    load = arm.payload
-    body = spec.body(load.parent).add_body(name="payload")
+    body = spec.body(arm.carrier).add_body(name="payload")
     body.explicitinertial = True
-    body.mass = load.mass
-    body.ipos = load.com
-    body.inertia = load.inertia
-
+    body.mass, body.ipos, body.inertia = arm.mass, arm.com, arm.inertia
     spec.worldbody.add_geom(name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0.0, 0.0, 0.05])
-
-    sphere = Capsule("payload", load.com, load.com, load.radius)
-    for i, capsule in enumerate((*arm.capsules, sphere)):
-        geom = spec.body(capsule.body).add_geom(
-            name=f"{capsule.body}_{i}", size=[capsule.radius, 0.0, 0.0], mass=0.0
-        )
-        if capsule.start == capsule.end:
-            geom.type = mujoco.mjtGeom.mjGEOM_SPHERE
-            geom.pos = capsule.start
+    sphere = ("payload", arm.com, arm.com, arm.radius)
+    for i, (carrier, start, end, radius) in enumerate((*arm.capsules, sphere)):
+        geom = spec.body(carrier).add_geom(name=f"{carrier}_{i}", size=[radius, 0.0, 0.0], mass=0.0)
+        if start == end:
+            geom.type, geom.pos = mujoco.mjtGeom.mjGEOM_SPHERE, start
         else:
             geom.type = mujoco.mjtGeom.mjGEOM_CAPSULE
-            geom.fromto = [*capsule.start, *capsule.end]
+            geom.fromto = [*start, *end]
 
     # MuJoCo refuses a pair that is excluded twice.
-    known = {frozenset((pair.bodyname1, pair.bodyname2)) for pair in spec.excludes}
+    known = [{pair.bodyname1, pair.bodyname2} for pair in spec.excludes]
     for one, other in arm.overlapping:
-        if frozenset((one, other)) not in known:
+        if {one, other} not in known:
             spec.add_exclude(bodyname1=one, bodyname2=other)
 
-
-def holding(model: Any, qpos: Array) -> Array:
-    """Compute the references at which position servos hold a pose against gravity.
-
-    Args:
-        model: Model with one servo for each joint.
-        qpos: (nq,) pose [rad].
-
-    Returns:
-        (nu,) references [rad].
-    """
+    # References at which the servos hold the pose against gravity.
+    model = spec.compile()
     data = mujoco.MjData(model)
-    data.qpos[:] = qpos
+    data.qpos[:] = arm.home
     mujoco.mj_forward(model, data)
-
     joints = model.actuator_trnid[:, 0]
-    load = data.qfrc_bias[model.jnt_dofadr[joints]]
-    deflection = load / model.actuator_gainprm[:, 0]
-    return np.asarray(qpos[model.jnt_qposadr[joints]] + deflection)
+    deflection = data.qfrc_bias[model.jnt_dofadr[joints]] / model.actuator_gainprm[:, 0]
+    key = spec.key("home")
+    key.qpos = list(arm.home)
+    key.ctrl = (data.qpos[model.jnt_qposadr[joints]] + deflection).tolist()
+
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / f"{name}{'_dry' if friction else ''}.xml"
+    path.write_text(spec.to_xml(), encoding="utf-8")
+    return path
 
 
 def start_control(hold: Array, horizon: float, amplitude: float) -> Array:
@@ -331,58 +273,38 @@ def start_control(hold: Array, horizon: float, amplitude: float) -> Array:
     return np.asarray(hold + amplitude * window * wave)
 
 
-def parameters(arm: Arm, friction: bool) -> dict[str, dict[str, Any]]:
-    """Return the tables of the unknowns: two or three for each joint and four of the payload."""
-    fields = ["damping", "armature"]
-    if friction:
-        fields.append("frictionloss")
-
-    found: dict[str, dict[str, Any]] = {}
-    for field in fields:
-        for joint in arm.joints:
-            found[f"{joint}_{field}"] = {"target": f"joint/{joint}:{field}"}
-
-    found["payload_mass"] = {"target": "body/payload:mass"}
-    for i, axis in enumerate("xyz"):
-        found[f"payload_{axis}"] = {"target": f"body/payload:ipos[{i}]", "scale": CENTRE_SCALE}
-    return found
-
-
-def experiment(
-    name: str,
-    horizon: float,
-    friction: bool,
-    model_folder: str | Path,
-) -> Experiment:
+def experiment(name: str, horizon: float, friction: bool, folder: Path) -> Experiment:
     """Make the experiment of an arm, from rest to rest at home, under hard limits.
 
     Args:
         name: Key of `ARMS`.
         horizon: Duration [s].
         friction: Whether the joints have dry friction, which is then unknown.
-        model_folder: Folder that receives the model and the starting control.
+        folder: Folder that receives the model and the starting control.
 
     Returns:
         The experiment.
     """
     arm = ARMS[name]
-    folder = Path(model_folder)
-    path = model_file(arm, name, friction, folder)
+    path = model_file(name, friction, folder)
 
     hold = np.array(mujoco.MjModel.from_xml_path(str(path)).key("home").ctrl)
+    start = start_control(hold, horizon, arm.amplitude)
     control = folder / f"{path.stem}_{horizon:g}s.csv"
-    write_control(control, arm.joints, start_control(hold, horizon, arm.amplitude))
+    rows = np.column_stack([np.arange(len(start)) / RATE, start])
+    header = ",".join(["t", *arm.joints])
+    np.savetxt(control, rows, fmt="%.12g", delimiter=",", header=header, comments="")
 
-    limits: dict[str, Any] = {
-        "velocity": arm.velocity,
-        "control_rate": arm.rate,
-        "clearance": CLEARANCE,
-        "ignored": arm.overlapping,
+    parameters: dict[str, Any] = {
+        f"{joint}_{field}": {"target": f"joint/{joint}:{field}"}
+        for field in ("damping", "armature", *(["frictionloss"] if friction else []))
+        for joint in arm.joints
     }
-    if arm.force is not None:
-        limits["force"] = arm.force
+    parameters["payload_mass"] = {"target": "body/payload:mass"}
+    for i, axis in enumerate("xyz"):
+        table = {"target": f"body/payload:ipos[{i}]", "scale": CENTRE_SCALE}
+        parameters[f"payload_{axis}"] = table
 
-    noise = {f"{kind}:{joint}": sigma for kind, sigma in NOISE.items() for joint in arm.joints}
     return Experiment(
         model=path.name,
         directory=folder,
@@ -391,22 +313,15 @@ def experiment(
         measure_rate=MEASURED,
         horizon=horizon,
         initial={"keyframe": "home", "control": control.name},
-        parameters=parameters(arm, friction),
-        noise=noise,
+        parameters=parameters,
+        noise={f"{kind}:{each}": sigma for kind, sigma in NOISE.items() for each in arm.joints},
         cost={"criterion": "E", "control": 0.0},
-        limits=limits,
+        limits={
+            "velocity": arm.velocity,
+            "control_rate": arm.rate,
+            "clearance": CLEARANCE,
+            "ignored": arm.overlapping,
+            **({} if arm.force is None else {"force": arm.force}),
+        },
         boundary={"start": "rest", "end": "rest"},
     )
-
-
-def write_control(path: Path, names: tuple[str, ...], control: Array) -> None:
-    """Write a table of times and controls as `initial.control` reads it.
-
-    Args:
-        path: File to write.
-        names: Names of the actuators.
-        control: (N, nu) control.
-    """
-    rows = np.column_stack([np.arange(len(control)) / RATE, control])
-    header = ",".join(["t", *names])
-    np.savetxt(path, rows, fmt="%.12g", delimiter=",", header=header, comments="")

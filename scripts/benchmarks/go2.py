@@ -10,7 +10,6 @@ joints whose left and right sides differ, and errors of predictions, open loop f
 
 from __future__ import annotations
 
-import itertools
 import time
 from pathlib import Path
 
@@ -18,13 +17,12 @@ import matplotlib.pyplot as plt
 import mujoco
 import numpy as np
 from rich.console import Console
-from rich.table import Table
 
 import mjfim
 from mjfim.arrays import Array
 from mjfim.experiment.system import System
 from mjfim.recordings.read import read_recording
-from scripts.benchmarks.child import new_table, options_of
+from scripts.benchmarks.child import new_table, options_of, rms
 
 LEGS = ("FL", "FR", "RL", "RR")
 KINDS = ("hip", "thigh", "calf")
@@ -114,8 +112,9 @@ def leg_alone(path: Path, leg: str) -> str:
     for each in LEGS:
         if each != leg:
             spec.delete(spec.body(f"{each}_hip"))
-    for actuator in [each for each in spec.actuators if not each.name.startswith(leg)]:
-        spec.delete(actuator)
+    for actuator in spec.actuators:
+        if not actuator.name.startswith(leg):
+            spec.delete(actuator)
     spec.option.timestep = PERIOD
     holding = {"solimp_friction": [0.9999, 0.9999, 0.001, 0.5, 2.0]}
     holding["solref_friction"] = [2.2 * PERIOD, 1.0]
@@ -170,27 +169,22 @@ def open_loop(system: System, theta: Array, references: Array, angles: Array) ->
     return np.asarray(plant.simulate(theta, references[:-1]).state[:, :3] + bias)
 
 
-def rms(errors: Array, axis: int | None = None) -> Array:
-    """Return the root mean square [mrad] of errors [rad]."""
-    return np.asarray(1e3 * np.sqrt(np.mean(errors**2, axis=axis)))
-
-
 def draw(path: Path, half: str, joints: list[str], curves: dict[str, Array]) -> None:
     """Draw angles of some joints in seconds that are not fitted, and errors of all seconds."""
     figure, axes = plt.subplots(len(joints), 2, figsize=(13, 8), sharex="col", layout="constrained")
     styles = {"reference": "C7", "as it comes": "C1", "identified": "C0", "measured": "k:"}
     shown = next(rows[-1] for other, rows in HALVES.items() if other != half)
-    for row, joint in enumerate(joints):
-        for name, angles in curves.items():
-            seconds = PERIOD * np.arange(len(angles))
-            axes[row, 0].plot(seconds[shown], angles[shown, row], styles[name], label=name)
-            if name in ("as it comes", "identified"):
-                error = 1e3 * (angles - curves["measured"])[:, row]
-                axes[row, 1].plot(seconds, error, styles[name], lw=1.0)
+    seconds = PERIOD * np.arange(len(curves["measured"]))
+    for row, (joint, (left, right)) in enumerate(zip(joints, axes, strict=True)):
+        for name, style in styles.items():
+            left.plot(seconds[shown], curves[name][shown, row], style, label=name)
+        for name in ("as it comes", "identified"):
+            error = 1e3 * (curves[name] - curves["measured"])[:, row]
+            right.plot(seconds, error, styles[name], lw=1.0)
         for rows in HALVES[half]:
-            axes[row, 1].axvspan(*seconds[rows][[0, -1]], color="0.92")
-        axes[row, 0].set_ylabel(f"{joint} [rad]")
-        axes[row, 1].set_ylabel("error [mrad]")
+            right.axvspan(*seconds[rows][[0, -1]], color="0.92")
+        left.set_ylabel(f"{joint} [rad]")
+        right.set_ylabel("error [mrad]")
     figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=4)
     axes[0, 0].set_title("seconds that are not fitted, open loop from the references")
     axes[0, 1].set_title("predicted minus measured; grey seconds are fitted")
@@ -200,83 +194,49 @@ def draw(path: Path, half: str, joints: list[str], curves: dict[str, Array]) -> 
     plt.close(figure)
 
 
-def table_of_parameters(found: dict[tuple[str, str], mjfim.Estimate], half: str) -> Table:
-    """Return the parameters of all joints with the half widths of their 95 % intervals."""
-    names = found[LEGS[0], half].parameters
-    quantities = list(dict.fromkeys(name.split()[0] for name in names if "bias" not in name))
-    table = new_table(f"Fitted to {half}, with half widths of 95 %", "joint", *quantities)
-    for kind, leg in itertools.product(KINDS, LEGS):
-        estimate, joint = found[leg, half], f"{leg}_{kind}"
-        cells = dict.fromkeys(quantities, "")
-        for name, value, interval in zip(
-            estimate.parameters, estimate.theta, estimate.interval, strict=True
-        ):
-            quantity, _, of_joint = name.partition(" ")
-            if of_joint in ("", joint):
-                cells[quantity] = f"{value:.4g} ± {0.5 * np.ptp(interval):.2g}"
-        table.add_row(joint, *cells.values())
-    return table
-
-
-def table_of_errors(half: str, joints: list[str], errors: Array, angles: Array) -> Table:
-    """Return where errors of predictions lie: angle and direction, speed, frequency.
+def kinds_of_error(error: Array, angle: Array, speed: Array) -> list[str]:
+    """Return where errors of predictions of a joint lie: angle and direction, speed, frequency.
 
     A mean over bins of 20 mrad for each direction is what depends on the angle and the direction.
     """
-    headings = ("all", "of angle and direction", "below 0.1 rad/s", "above 1 rad/s", "90 % below")
-    table = new_table(f"What is left in {half}, rms in mrad", "joint", *headings)
-    speeds = np.gradient(angles, PERIOD, axis=0)
-    frequencies = np.fft.rfftfreq(len(errors), PERIOD)
-    for joint, error, angle, speed in zip(joints, errors.T, angles.T, speeds.T, strict=True):
-        bins = 2 * np.floor((angle - angle.min()) / 0.02).astype(int) + (speed > 0.0)
-        means = np.bincount(bins, error) / np.maximum(np.bincount(bins), 1)
-        power = np.cumsum(np.abs(np.fft.rfft(error)) ** 2)
-        highest = frequencies[np.searchsorted(power, 0.9 * power[-1])]
-        by_speed = (error[each] for each in (np.abs(speed) < 0.1, np.abs(speed) > 1.0))
-        found = (rms(each) if len(each) else np.nan for each in by_speed)
-        numbers = [rms(error), rms(means[bins]), *found]
-        table.add_row(joint, *(f"{number:.1f}" for number in numbers), f"{highest:.1f} Hz")
-    return table
+    bins = 2 * np.floor((angle - angle.min()) / 0.02).astype(int) + (speed > 0.0)
+    means = np.bincount(bins, error) / np.maximum(np.bincount(bins), 1)
+    power = np.cumsum(np.abs(np.fft.rfft(error)) ** 2)
+    highest = np.searchsorted(power, 0.9 * power[-1]) / (PERIOD * len(error))
+    parts = (error, means[bins], error[np.abs(speed) < 0.1], error[np.abs(speed) > 1.0])
+    numbers = (1e3 * rms(each) if len(each) else np.nan for each in parts)
+    return [*(f"{number:.1f}" for number in numbers), f"{highest:.1f} Hz"]
 
 
 def relative_widths(estimate: mjfim.Estimate, joint: str) -> list[float]:
-    """Return half widths of 95 % [%] of kp, kd, friction, their ratios to kp, and the ramp's lag.
-
-    A measured angle lags behind a ramp by kd / kp + latency - feedback latency.
-    """
-    names = (*(f"{name} {joint}" for name in ("kp", "kd", "friction", "latency")), "feedback")
-    places = [estimate.parameters.index(name) for name in names]
-    kp, kd, friction, latency, feedback = np.maximum(estimate.theta[places], 1e-9)
-    lag = kd / kp + latency - feedback
-    weights = np.array(
-        [
-            [1.0 / kp, 0.0, 0.0, 0.0, 0.0],
-            [0.0, 1.0 / kd, 0.0, 0.0, 0.0],
-            [0.0, 0.0, 1.0 / friction, 0.0, 0.0],
-            [-1.0 / kp, 1.0 / kd, 0.0, 0.0, 0.0],
-            [-1.0 / kp, 0.0, 1.0 / friction, 0.0, 0.0],
-            [-kd / kp**2 / lag, 1.0 / kp / lag, 0.0, 1.0 / lag, -1.0 / lag],
-        ]
-    )
-    covariance = estimate.honest_covariance[np.ix_(places, places)]
+    """Return half widths of 95 % [%] of kp, kd, friction, and their ratios to kp."""
+    places = [estimate.parameters.index(f"{name} {joint}") for name in ("kp", "kd", "friction")]
+    values = np.maximum(estimate.theta[places], 1e-9)
+    covariance = estimate.honest_covariance[np.ix_(places, places)] / np.outer(values, values)
+    weights = np.vstack([np.eye(3), [[-1.0, 1.0, 0.0], [-1.0, 0.0, 1.0]]])
     # The variance of what is not determined is infinite; other weights are zero.
     counted = [(row[row != 0.0], covariance[np.ix_(row != 0.0, row != 0.0)]) for row in weights]
     return [196.0 * float(np.sqrt(row @ part @ row)) for row, part in counted]
 
 
-def ranges_of(estimate: mjfim.Estimate, joint: str) -> dict[str, Array]:
-    """Return the 95 % intervals of a joint by quantity."""
+def quantities_of(estimate: mjfim.Estimate, joint: str) -> dict[str, tuple[float, Array]]:
+    """Return values and 95 % intervals of a joint, and of the delay that its leg shares."""
+    rows = zip(estimate.parameters, estimate.theta, estimate.interval, strict=True)
     return {
-        name.split()[0]: interval
-        for name, interval in zip(estimate.parameters, estimate.interval, strict=True)
-        if name.endswith(f" {joint}")
+        name.split()[0]: (value, interval)
+        for name, value, interval in rows
+        if name.partition(" ")[2] in ("", joint)
     }
 
 
-def apart(first: dict[str, Array], second: dict[str, Array]) -> list[str]:
-    """Return the quantities whose intervals do not overlap."""
-    pairs = {name: (first[name], second[name]) for name in first}
-    return [name for name, (a, b) in pairs.items() if a[1] < b[0] or b[1] < a[0]]
+def apart(*found: dict[str, tuple[float, Array]]) -> str:
+    """Return the quantities of two joints whose intervals do not overlap."""
+    names = []
+    for name in found[0]:
+        (_, a), (_, b) = (each[name] for each in found)
+        if name != "feedback" and (a[1] < b[0] or b[1] < a[0]):
+            names.append(name)
+    return str(names or "nothing")
 
 
 def main() -> int:
@@ -307,8 +267,8 @@ def main() -> int:
         logs: dict[str, list[mjfim.Recording]] = {half: [] for half in HALVES}
         for half, part in ((half, part) for half, parts in HALVES.items() for part in parts):
             path = output / f"{leg}_from_row_{part.start}.csv"
-            both = np.hstack([references[part, columns], angles[part, columns]])
-            timed = np.column_stack([PERIOD * np.arange(len(both)), both])
+            rows = np.hstack([references[part, columns], angles[part, columns]])
+            timed = np.column_stack([PERIOD * np.arange(len(rows)), rows])
             np.savetxt(path, timed, "%.7f", ",", header=",".join(header), comments="")
             logs[half].append(read_recording(path, system.channels))
         for half, others in zip(HALVES, reversed(HALVES), strict=True):
@@ -320,30 +280,46 @@ def main() -> int:
             )
         console.print(f"{leg}: {(time.process_time() - begun) / 60.0:.1f} minutes of a processor")
 
-    for half in HALVES:
-        console.print(table_of_parameters(found, half))
-        names = ("kp", "kd", "friction", "kd / kp", "friction / kp", "lag behind a ramp")
-        table = new_table("Half widths of 95 % [%], median of four legs", "joints", *names)
+    ratios = ("kp", "kd", "friction", "kd / kp", "friction / kp")
+    by_kind = [f"{leg}_{kind}" for kind in KINDS for leg in LEGS]
+    ranges = {
+        half: {joint: quantities_of(found[joint[:2], half], joint) for joint in by_kind}
+        for half in HALVES
+    }
+    for half, of_joints in ranges.items():
+        quantities = of_joints[by_kind[-1]]
+        table = new_table(f"Fitted to {half}, with half widths of 95 %", "joint", *quantities)
+        for joint, values in of_joints.items():
+            cells = [
+                f"{value:.4g} ± {0.5 * np.ptp(interval):.2g}" for value, interval in values.values()
+            ]
+            table.add_row(joint, *cells)
+        console.print(table)
+        table = new_table("Half widths of 95 % [%], median of four legs", "joints", *ratios)
         for kind in KINDS:
             widths = [relative_widths(found[leg, half], f"{leg}_{kind}") for leg in LEGS]
             table.add_row(kind, *(f"{each:.1f}" for each in np.median(widths, axis=0)))
         console.print(table)
-        for joint in (f"{end}_{kind}" for kind in KINDS for end in ("F", "R")):
-            sides = [joint[0] + side + joint[1:] for side in "LR"]
-            both_sides = [ranges_of(found[side[:2], half], side) for side in sides]
-            console.print(f"{' and '.join(sides)} differ in: {apart(*both_sides) or 'nothing'}")
+        for left, right in zip(by_kind[::2], by_kind[1::2], strict=True):
+            difference = apart(of_joints[left], of_joints[right])
+            console.print(f"{left} and {right} differ in: {difference}")
     for joint in every:
-        both_halves = [ranges_of(found[joint[:2], half], joint) for half in HALVES]
-        console.print(f"halves of {joint} differ in: {apart(*both_halves) or 'nothing'}")
+        difference = apart(*(of_joints[joint] for of_joints in ranges.values()))
+        console.print(f"halves of {joint} differ in: {difference}")
 
     table = new_table("rms error in mrad of seconds that are not fitted", "fitted", "all", *every)
+    kinds = ("all", "of angle and direction", "below 0.1 rad/s", "above 1 rad/s", "90 % below")
     for half, others in zip(HALVES, reversed(HALVES), strict=True):
         rows = np.concatenate([np.arange(len(angles))[part] for part in HALVES[others]])
         errors = [(each - angles)[rows] for each in (predicted[half], stated)]
-        ours, theirs = (np.array([rms(each), *rms(each, 0)]) for each in errors)
+        ours, theirs = (1e3 * np.array([rms(each), *rms(each, 0)]) for each in errors)
         for name, numbers in (("", ours), (" as it comes", theirs), (" factor", theirs / ours)):
             table.add_row(f"{half}{name}", *(f"{number:.1f}" for number in numbers))
-        console.print(table_of_errors(others, every, errors[0], angles[rows]))
+        left_over = new_table(f"What is left in {others}, rms in mrad", "joint", *kinds)
+        speeds = np.gradient(angles[rows], PERIOD, axis=0)
+        for name, *parts in zip(every, errors[0].T, angles[rows].T, speeds.T, strict=True):
+            left_over.add_row(name, *kinds_of_error(*parts))
+        console.print(left_over)
 
         shown = [every.index(f"{LEGS[0]}_{kind}") for kind in KINDS]
         curves = {

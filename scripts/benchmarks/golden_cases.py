@@ -2,8 +2,7 @@
 
 A case is one or several command lines, divided by ` ; `. They run in a folder that holds the
 repository's models and, as `shared`, measured data and public models. A word such as
-`cart_pendulum+descent.starts=2` is the experiment file with these keys changed. `@stop` before a
-command line sends Ctrl-C after some seconds of processor time, `@kill` ends the process.
+`cart_pendulum+descent.starts=2` is the experiment file with these keys changed.
 """
 
 from __future__ import annotations
@@ -63,11 +62,6 @@ CASES: dict[str, str] = {
     "limits block": "design sliding_block+descent.starts=1+descent.seconds=8 -o o",
     "limits infeasible": "design cart_pendulum_limits+boundary.end=free"
     "+limits.position.slide=[0.5,1.0] -o o",
-    # A design that is stopped or killed.
-    "stopped": "@stop=6 design cart_pendulum_limits+boundary.end=free -o o",
-    "stopped early": "@stop=1 design cart_pendulum_limits+boundary.end=free -o o",
-    "killed": "@kill=6 design cart_pendulum_limits+boundary.end=free -o o"
-    " ; design cart_pendulum+descent.max_iterations=5 -o o",
     # Simulated recordings and estimates.
     "identify cart": "simulate cart_pendulum_guess.toml -o r.csv"
     " ; identify cart_pendulum_guess.toml r.csv -o o",
