@@ -7,14 +7,14 @@ from __future__ import annotations
 
 import sys
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont, ImageSequence
 
 import mjfim
+from scripts.benchmarks.child import ROOT
 
-EXPERIMENT = Path(__file__).resolve().parent.parent / "models" / "cart_pendulum_rig.toml"
+EXPERIMENT = ROOT / "models" / "cart_pendulum_rig.toml"
 
 # Width of the GIF, height of a bar, row and longest bar [pixels], and milliseconds of a frame and
 # of the last one.

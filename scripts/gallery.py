@@ -8,7 +8,7 @@ parameters differ from the model, or are logs of a real SO-101. A design ends af
 of iterations or where it has converged, so that its numbers do not depend on the speed of the
 computer.
 
-`--shared` is a folder with `models/so101` and the logs `data/sage_so101`.
+The folder `shared` beside the repository holds `models/so101` and the logs `data/sage_so101`.
 """
 
 from __future__ import annotations
@@ -385,7 +385,6 @@ def _is_same(old: str, new: str) -> bool:
 def main() -> int:
     """Make the gallery, or compare its numbers; exit code 1 if a call fails or they differ."""
     parser = options_of(__doc__)
-    parser.add_argument("--shared", type=Path, default=SHARED)
     parser.add_argument("--check", action="store_true", help="compare the numbers of the page")
     options = parser.parse_args()
 
@@ -393,11 +392,11 @@ def main() -> int:
     with tempfile.TemporaryDirectory() as name:
         root, shown = Path(name), []
         (root / "models").symlink_to(ROOT / "models")
-        (root / "shared").symlink_to(options.shared.resolve())
+        (root / "shared").symlink_to(SHARED)
         for robot in ROBOTS:
             missing = [path for path in (robot.source, robot.log) if not (root / path).exists()]
             if missing and not options.check:
-                parser.error(f"{options.shared}: there is no {missing[0]}")
+                parser.error(f"there is no {missing[0]} beside the repository")
             if not missing:
                 shown.append((robot, list(show_robot(robot, root, is_quick=options.check))))
         calls = [call for _, calls in shown for call in calls]

@@ -1,7 +1,7 @@
 """J against seconds: the design beside its baselines at every budget, as a table.
 
     python -m scripts.benchmarks anytime FOLDER [--seconds 2 3 5 10]
-    [--examples cart_pendulum_limits] [--methods fourier5 fourier15]
+    [--examples cart_pendulum_limits]
     python -m scripts.benchmarks anytime FOLDER --show        # the results in FOLDER
 
 Each method runs anew for each budget, in one thread, because a search plans with its budget. The
@@ -31,9 +31,6 @@ from scripts.benchmarks.child import ROOT, kept, new_table, options_of
 # Folder of the examples.
 EXAMPLES = ROOT / "models"
 
-# Budgets of every method [s of the processor].
-SECONDS = (2.0, 3.0, 5.0, 10.0)
-
 # Baselines that run without further wishes: the best ones of the whole list.
 METHODS = ("multisine", "fourier5", "fourier15", "splines")
 
@@ -41,13 +38,12 @@ METHODS = ("multisine", "fourier5", "fourier15", "splines")
 TIE = 1e-3
 
 
-def compute(path: Path, seconds: float, methods: list[str]) -> list[dict[str, Any]] | None:
+def compute(path: Path, seconds: float) -> list[dict[str, Any]] | None:
     """Run all methods on an example with one budget.
 
     Args:
         path: Experiment file.
         seconds: Budget of every method [s of the processor].
-        methods: Keys of the baselines.
 
     Returns:
         J of each method on the unmodified model, infinite where no control keeps the limits, and
@@ -57,7 +53,7 @@ def compute(path: Path, seconds: float, methods: list[str]) -> list[dict[str, An
     experiment = Experiment.from_file(path).replace(boundary={"end": "free"})
     try:
         with measured_by(time.process_time):
-            found = mjfim.compare(experiment, seconds=seconds, methods=methods, threads=1)
+            found = mjfim.compare(experiment, seconds=seconds, methods=METHODS, threads=1)
     except MjfimError as error:
         print(f"{path.stem}: {error}")
         return None
@@ -74,44 +70,44 @@ def main() -> int:
     """Run what is missing and print the table; 1 if a baseline is better."""
     parser = options_of(__doc__)
     parser.add_argument("folder", type=Path)
-    parser.add_argument("--seconds", nargs="+", type=float, default=list(SECONDS))
+    parser.add_argument("--seconds", nargs="+", type=float, default=[2.0, 3.0, 5.0, 10.0])
     parser.add_argument("--examples", nargs="*", help="names of examples; default: all")
-    parser.add_argument("--methods", nargs="+", default=list(METHODS), help="baselines")
     parser.add_argument("--show", action="store_true", help="only show the results in the folder")
     args = parser.parse_args()
 
     title = "J within the same seconds of the processor, one thread"
     headings = [f"{seconds:g} s" for seconds in args.seconds]
     table = new_table(title, "experiment", "method", *headings, texts=2)
-    beaten: dict[float, list[str]] = {seconds: [] for seconds in args.seconds}
-    tried = dict.fromkeys(args.seconds, 0)
+    tried: list[tuple[float, str, bool]] = []
     for path in sorted(EXAMPLES.glob("*.toml")):
         if args.examples is not None and path.stem not in args.examples:
             continue
-        mine, theirs, is_known = [], [], False
+        mine, theirs = [], []
         for seconds in args.seconds:
             rows = kept(
                 args.folder / f"{path.stem}_{seconds:g}s.json",
-                partial(compute, path, seconds, args.methods),
+                partial(compute, path, seconds),
                 is_shown=args.show,
             )
-            costs = {row["method"]: row["cost"] for row in rows or ()}
+            if rows is None:
+                continue
+            costs = {row["method"]: row["cost"] for row in rows}
             own = costs.pop(DESIGN, np.inf)
             best, method = min(((J, method) for method, J in costs.items()), default=(np.inf, ""))
             is_beaten = best < (own - TIE * abs(own) if np.isfinite(own) else own)
-            tried[seconds] += rows is not None
-            is_known = is_known or rows is not None
-            beaten[seconds] += [path.stem] * is_beaten
+            tried.append((seconds, path.stem, is_beaten))
             mine.append(f"{own:.5g}{' [red]beaten[/red]' if is_beaten else ''}")
             theirs.append(f"{best:.5g} {method}")
-        if is_known:
+        if mine:
             table.add_row(path.stem, "design", *mine)
             table.add_row("", "best baseline", *theirs)
             table.add_section()
 
     Console(highlight=False, width=60 + 24 * len(args.seconds)).print(table)
-    for seconds, names in beaten.items():
-        count = tried[seconds]
-        sentence = f"{seconds:g} s: the design is best in {count - len(names)} of {count}"
-        print(f"{sentence}; a baseline wins in {', '.join(names)}" if names else sentence)
-    return int(any(beaten.values()) or not any(tried.values()))
+    for seconds in args.seconds:
+        group = {name: is_beaten for budget, name, is_beaten in tried if budget == seconds}
+        losses = [name for name, is_beaten in group.items() if is_beaten]
+        wins = len(group) - len(losses)
+        sentence = f"{seconds:g} s: the design is best in {wins} of {len(group)}"
+        print(f"{sentence}; a baseline wins in {', '.join(losses)}" if losses else sentence)
+    return int(not tried or any(is_beaten for *_, is_beaten in tried))

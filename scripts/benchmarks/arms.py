@@ -31,7 +31,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from mjfim.arrays import Array, record
+from mjfim.arrays import record
 from mjfim.experiment.initial import multisine
 from mjfim.experiment.schema import Experiment
 from scripts.benchmarks.child import SHARED
@@ -253,26 +253,6 @@ def model_file(name: str, friction: bool, folder: Path) -> Path:
     return path
 
 
-def start_control(hold: Array, horizon: float, amplitude: float) -> Array:
-    """Compute a small multisine about the hold that is at rest at both ends.
-
-    Args:
-        hold: (nu,) control that holds the pose [rad].
-        horizon: Duration [s].
-        amplitude: Amplitude of every joint [rad].
-
-    Returns:
-        (N, nu) control [rad].
-    """
-    t = np.arange(round(horizon * RATE)) / RATE
-    end = horizon - REST
-    growth = np.clip(np.minimum(t, end - t) / RISE, 0.0, 1.0)
-    window = np.sin(0.5 * np.pi * growth)[:, None] ** 2
-
-    wave = multisine(t, len(hold), FUNDAMENTAL, HARMONICS, np.random.default_rng(0))
-    return np.asarray(hold + amplitude * window * wave)
-
-
 def experiment(name: str, horizon: float, friction: bool, folder: Path) -> Experiment:
     """Make the experiment of an arm, from rest to rest at home, under hard limits.
 
@@ -289,11 +269,16 @@ def experiment(name: str, horizon: float, friction: bool, folder: Path) -> Exper
     path = model_file(name, friction, folder)
 
     hold = np.array(mujoco.MjModel.from_xml_path(str(path)).key("home").ctrl)
-    start = start_control(hold, horizon, arm.amplitude)
+    # A small multisine about the hold, at rest at both ends.
+    t = np.arange(round(horizon * RATE)) / RATE
+    growth = np.clip(np.minimum(t, horizon - REST - t) / RISE, 0.0, 1.0)
+    wave = multisine(t, len(hold), FUNDAMENTAL, HARMONICS, np.random.default_rng(0))
+    start = hold + arm.amplitude * np.sin(0.5 * np.pi * growth)[:, None] ** 2 * wave
     control = folder / f"{path.stem}_{horizon:g}s.csv"
-    rows = np.column_stack([np.arange(len(start)) / RATE, start])
     header = ",".join(["t", *arm.joints])
-    np.savetxt(control, rows, fmt="%.12g", delimiter=",", header=header, comments="")
+    np.savetxt(
+        control, np.column_stack([t, start]), fmt="%.12g", delimiter=",", header=header, comments=""
+    )
 
     parameters: dict[str, Any] = {
         f"{joint}_{field}": {"target": f"joint/{joint}:{field}"}

@@ -134,39 +134,6 @@ def mjfim_run(repeats: int, case: str, name: str, **descent: Any) -> tuple[Run, 
     ), design
 
 
-def engine_share(run: Run, design: Design) -> list[str]:
-    """Compare a design with the time of the engine, a row of table (a).
-
-    The model of the user is stepped many times in each call, from states of the designed motion.
-    """
-    task = DesignTask.resolve(Experiment.from_file(EXPERIMENT).replace(cost=CASES[run.case]))
-    model, data = task.system.model_at(task.theta), mujoco.MjData(task.system.model)
-    motion, step = design.trajectory, np.inf
-    for k in range(0, motion.samples, 20):
-        data.qpos[:], data.qvel[:], data.ctrl[:] = motion.qpos[k], motion.qvel[k], motion.ctrl[k]
-        clock = time.perf_counter()
-        mujoco.mj_step(model, data, 500)
-        step = min(step, (time.perf_counter() - clock) / 500)
-    engine = design.steps * step / cores()
-    seconds = (f"{engine:.3f} s", f"{design.seconds:.3f} s", f"{design.seconds / engine:.2f}")
-    return [run.case, run.solver, f"{design.steps:,}", f"{1e6 * step:.2f} µs", *seconds]
-
-
-def peer_runs(cases: str, repeats: int) -> list[Run]:
-    """Run the solvers of CasADi on cases; the list is empty where CasADi is not installed."""
-    done = subprocess.run(
-        [sys.executable, "-c", PEERS, str(repeats), cases],
-        capture_output=True,
-        text=True,
-        env={**os.environ, "OPENBLAS_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)},
-        check=False,
-    )
-    if done.returncode:
-        print(f"left out: {done.stderr.strip().splitlines()[-1]}", file=sys.stderr)
-        return []
-    return [Run(**row) for row in json.loads(done.stdout.splitlines()[-1])]
-
-
 def main() -> None:
     """Run all comparisons and print their tables."""
     parser = options_of(__doc__)
@@ -182,15 +149,39 @@ def main() -> None:
     flat = [mjfim_run(repeats, case, "mjfim, one level", coarse=1) for case in cases]
     headings = ("case", "descent", "steps", "mj_step", "engine", "wall", "ratio")
     table = new_table("(a) design over bare engine time (target 1.3)", *headings, texts=2)
-    for pair in [*default, *flat]:
-        table.add_row(*engine_share(*pair))
+    for run, design in [*default, *flat]:
+        # The model of the user is stepped many times in each call, from states of the motion.
+        task = DesignTask.resolve(Experiment.from_file(EXPERIMENT).replace(cost=CASES[run.case]))
+        model, data = task.system.model_at(task.theta), mujoco.MjData(task.system.model)
+        motion, step = design.trajectory, np.inf
+        for k in range(0, motion.samples, 20):
+            data.qpos[:], data.qvel[:] = motion.qpos[k], motion.qvel[k]
+            data.ctrl[:] = motion.ctrl[k]
+            clock = time.perf_counter()
+            mujoco.mj_step(model, data, 500)
+            step = min(step, (time.perf_counter() - clock) / 500)
+        engine = design.steps * step / cores()
+        cells = (run.case, run.solver, f"{design.steps:,}", f"{1e6 * step:.2f} µs")
+        ratio = f"{design.seconds / engine:.2f}"
+        table.add_row(*cells, f"{engine:.3f} s", f"{design.seconds:.3f} s", ratio)
     console.print(table)
 
     # (b)
     title = "(b) seconds until J is within 1e-6 of the best J found from this start"
     others = ("J", "iterations", "to 1e-6", "before the first iterate")
     table = new_table(title, "case", "solver", *others, texts=2)
-    runs = [*(run for run, _ in default), *peer_runs(cases, repeats)]
+    peers = subprocess.run(
+        [sys.executable, "-c", PEERS, str(repeats), cases],
+        capture_output=True,
+        text=True,
+        env={**os.environ, "OPENBLAS_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)},
+        check=False,
+    )
+    runs = [run for run, _ in default]
+    if peers.returncode:
+        print(f"left out: {peers.stderr.strip().splitlines()[-1]}", file=sys.stderr)
+    else:
+        runs += [Run(**row) for row in json.loads(peers.stdout.splitlines()[-1])]
     for run in sorted(runs, key=lambda run: run.case):
         seconds = run.reached([each for each in runs if each.case == run.case])[1]
         cells = (run.case, run.solver, f"{run.cost:.9g}", str(run.iterations))

@@ -298,7 +298,17 @@ def problem(use_c: bool = True) -> Any:
     if use_c:
         try:
             blocks = [value, gradient, parts.linear, parts.curvature]
-            value, gradient, parts.linear, parts.curvature = compile_c(blocks)
+            generator = ca.CodeGenerator("peer.c")
+            for function in blocks:
+                generator.add(function)
+            command = [shutil.which(os.environ.get("CC", "gcc")) or "cc"]
+            command += ["-O3", "-march=native", "-fPIC", "-shared"]
+            with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
+                library = os.path.join(folder, "peer.so")
+                source = generator.generate(folder + os.sep)
+                subprocess.run([*command, source, "-o", library], check=True)
+                blocks = [ca.external(function.name(), library) for function in blocks]
+            value, gradient, parts.linear, parts.curvature = blocks
             compiled = True
         except (OSError, subprocess.CalledProcessError) as error:
             message = f"casadi_peer: no C compiler ({error}); using CasADi's virtual machine"
@@ -315,20 +325,6 @@ def problem(use_c: bool = True) -> Any:
         compiled=compiled,
         build_seconds=time.perf_counter() - begin,
     )
-
-
-def compile_c(functions: list[ca.Function]) -> list[ca.Function]:
-    """Compile functions to machine code, in the order of the argument."""
-    generator = ca.CodeGenerator("peer.c")
-    for function in functions:
-        generator.add(function)
-    compiler = shutil.which(os.environ.get("CC", "gcc")) or "cc"
-    options = ["-O3", "-march=native", "-fPIC", "-shared"]
-    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
-        library = os.path.join(folder, "peer.so")
-        source = generator.generate(folder + os.sep)
-        subprocess.run([compiler, *options, source, "-o", library], check=True)
-        return [ca.external(function.name(), library) for function in functions]
 
 
 def parameters(case: Case) -> Array:

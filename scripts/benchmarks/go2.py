@@ -194,20 +194,6 @@ def draw(path: Path, half: str, joints: list[str], curves: dict[str, Array]) -> 
     plt.close(figure)
 
 
-def kinds_of_error(error: Array, angle: Array, speed: Array) -> list[str]:
-    """Return where errors of predictions of a joint lie: angle and direction, speed, frequency.
-
-    A mean over bins of 20 mrad for each direction is what depends on the angle and the direction.
-    """
-    bins = 2 * np.floor((angle - angle.min()) / 0.02).astype(int) + (speed > 0.0)
-    means = np.bincount(bins, error) / np.maximum(np.bincount(bins), 1)
-    power = np.cumsum(np.abs(np.fft.rfft(error)) ** 2)
-    highest = np.searchsorted(power, 0.9 * power[-1]) / (PERIOD * len(error))
-    parts = (error, means[bins], error[np.abs(speed) < 0.1], error[np.abs(speed) > 1.0])
-    numbers = (1e3 * rms(each) if len(each) else np.nan for each in parts)
-    return [*(f"{number:.1f}" for number in numbers), f"{highest:.1f} Hz"]
-
-
 def relative_widths(estimate: mjfim.Estimate, joint: str) -> list[float]:
     """Return half widths of 95 % [%] of kp, kd, friction, and their ratios to kp."""
     places = [estimate.parameters.index(f"{name} {joint}") for name in ("kp", "kd", "friction")]
@@ -316,18 +302,24 @@ def main() -> int:
         for name, numbers in (("", ours), (" as it comes", theirs), (" factor", theirs / ours)):
             table.add_row(f"{half}{name}", *(f"{number:.1f}" for number in numbers))
         left_over = new_table(f"What is left in {others}, rms in mrad", "joint", *kinds)
+        # A mean over bins of 20 mrad for each direction is what depends on both.
         speeds = np.gradient(angles[rows], PERIOD, axis=0)
-        for name, *parts in zip(every, errors[0].T, angles[rows].T, speeds.T, strict=True):
-            left_over.add_row(name, *kinds_of_error(*parts))
+        for joint, error, angle, speed in zip(
+            every, errors[0].T, angles[rows].T, speeds.T, strict=True
+        ):
+            bins = 2 * np.floor((angle - angle.min()) / 0.02).astype(int) + (speed > 0.0)
+            means = np.bincount(bins, error) / np.maximum(np.bincount(bins), 1)
+            power = np.cumsum(np.abs(np.fft.rfft(error)) ** 2)
+            highest = np.searchsorted(power, 0.9 * power[-1]) / (PERIOD * len(error))
+            parts = (error, means[bins], error[np.abs(speed) < 0.1], error[np.abs(speed) > 1.0])
+            sizes = (f"{1e3 * rms(each) if len(each) else np.nan:.1f}" for each in parts)
+            left_over.add_row(joint, *sizes, f"{highest:.1f} Hz")
         console.print(left_over)
 
         shown = [every.index(f"{LEGS[0]}_{kind}") for kind in KINDS]
-        curves = {
-            "reference": references[:, shown],
-            "as it comes": stated[:, shown],
-            "identified": predicted[half][:, shown],
-            "measured": angles[:, shown],
-        }
+        motions = {"reference": references, "as it comes": stated, "measured": angles}
+        motions["identified"] = predicted[half]
+        curves = {name: each[:, shown] for name, each in motions.items()}
         picture = output / f"predicted_from_row_{HALVES[others][0].start}.png"
         draw(picture, half, [every[i] for i in shown], curves)
     console.print(table)

@@ -145,11 +145,8 @@ def main() -> int:
     if args.verb == "run":
         results = json.loads(args.out.read_text()) if args.out.exists() else {}
         for name in (name for name in CASES if args.only in name):
-            results[name] = run_case(CASES[name], args.tree.resolve())
-            print(
-                f"{name:20s} {results[name]['found']['codes']} {results[name]['cpu']:.1f} s",
-                flush=True,
-            )
+            results[name] = case = run_case(CASES[name], args.tree.resolve())
+            print(f"{name:20s} {case['found']['codes']} {case['cpu']:.1f} s", flush=True)
             args.out.write_text(json.dumps(results, indent=1))
         return 0
 

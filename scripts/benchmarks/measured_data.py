@@ -109,45 +109,6 @@ SETS = (
 )
 
 
-def identified(data: Path, measured: MeasuredSet, is_selecting: bool) -> list[str]:
-    """Identify a set, and return the cells of its result.
-
-    Args:
-        data: Folder of all data.
-        measured: The set.
-        is_selecting: Whether terms are selected.
-    """
-    fit = mjfim.select_terms if is_selecting else mjfim.identify
-    names = (measured.fitted, measured.held_out)
-    fitted, held_out = (measured.read(data, each) for each in names)
-    begun = time.perf_counter()
-    found = fit(measured.experiment(), fitted, held_out=held_out)
-    seconds = time.perf_counter() - begun
-
-    changes = []
-    selection = found.selection
-    if selection is not None:
-        print(measured.name, selection, flush=True)
-        changes = [term.description for term in selection.terms]
-        changes += [f"one {pool.name}" for pool in selection.pooled]
-        changes += [f"{name} held at its guess" for name in selection.held]
-
-    # A parameter that is held at its guess has no interval.
-    halves = 0.5 * np.ptp(found.interval, axis=1) / np.maximum(np.abs(found.theta), 1e-300)
-    halves = halves[[name not in found.held for name in found.parameters]]
-    ratios = [prediction.ratio for prediction in found.predictions if prediction.held_out]
-    logs = f"{measured.name}, {len(fitted)} fitted, {len(held_out)} predicted"
-    return [
-        logs if not is_selecting else "",
-        "--select" if is_selecting else "as stated",
-        ", ".join(changes) or "–",
-        ", ".join(f"{ratio:.3g}" for ratio in ratios),
-        f"{100.0 * float(np.median(halves)):.1f} %",
-        "; ".join(found.reasons) if found.misfit else "none",
-        f"{seconds:.0f}",
-    ]
-
-
 def main() -> int:
     """Identify every set with and without selection, and print what was found."""
     parser = options_of(__doc__)
@@ -165,7 +126,35 @@ def main() -> int:
             print(f"skipped: {args.data / measured.folder} is not there", file=sys.stderr)
             continue
         for is_selecting in (False, True):
-            row = identified(args.data, measured, is_selecting)
+            fit = mjfim.select_terms if is_selecting else mjfim.identify
+            names = (measured.fitted, measured.held_out)
+            fitted, held_out = (measured.read(args.data, each) for each in names)
+            begun = time.perf_counter()
+            found = fit(measured.experiment(), fitted, held_out=held_out)
+            seconds = time.perf_counter() - begun
+
+            changes = []
+            selection = found.selection
+            if selection is not None:
+                print(measured.name, selection, flush=True)
+                changes = [term.description for term in selection.terms]
+                changes += [f"one {pool.name}" for pool in selection.pooled]
+                changes += [f"{name} held at its guess" for name in selection.held]
+
+            # A parameter that is held at its guess has no interval.
+            halves = 0.5 * np.ptp(found.interval, axis=1) / np.maximum(np.abs(found.theta), 1e-300)
+            halves = halves[[name not in found.held for name in found.parameters]]
+            ratios = [prediction.ratio for prediction in found.predictions if prediction.held_out]
+            logs = f"{measured.name}, {len(fitted)} fitted, {len(held_out)} predicted"
+            row = [
+                logs if not is_selecting else "",
+                "--select" if is_selecting else "as stated",
+                ", ".join(changes) or "–",
+                ", ".join(f"{ratio:.3g}" for ratio in ratios),
+                f"{100.0 * float(np.median(halves)):.1f} %",
+                "; ".join(found.reasons) if found.misfit else "none",
+                f"{seconds:.0f}",
+            ]
             table.add_row(*row)
 
             # Each row is shown at once as well, because all of them take minutes.

@@ -197,8 +197,16 @@ def oracle(case: Case, task: DesignTask, w: Array) -> tuple[Array, Array, Array,
     unit = np.eye(nx + nu + p)
 
     with jax.enable_x64(True):
+        function = _sample_map(case, task)
+
+        def derivatives(z: Any, a: Any, b: Any) -> tuple[Any, Any, Any]:
+            """f, Df[a] and D²f[a, b] at a point z."""
+            along = lambda z: jax.jvp(function, (z,), (a,))  # noqa: E731
+            (value, first), (_, second) = jax.jvp(along, (z,), (b,))
+            return value, first, second
+
         # One compiled function for all derivatives: MJX takes long to compile, and no time to run.
-        directional = jax.jit(_directional(_sample_map(case, task)))
+        directional = jax.jit(jax.vmap(derivatives))
 
         # First derivatives, and from them psi by its recursion.
         no_direction = np.zeros_like(points)
@@ -214,19 +222,6 @@ def oracle(case: Case, task: DesignTask, w: Array) -> tuple[Array, Array, Array,
         second = [directional(points, np.tile(e, (N, 1)), along)[2] for e in unit[: nx + nu]]
     mixed = np.stack([np.asarray(each) for each in second], axis=-1)
     return np.asarray(moves[0][0]), psi, first[..., : nx + nu], mixed
-
-
-def _directional(function: Any) -> Any:
-    """Return the function of (N, n) points and two directions that gives f, Df[a] and D²f[a, b]."""
-
-    def at(z: Any, a: Any, b: Any) -> tuple[Any, Any, Any]:
-        def along_a(z: Any) -> Any:
-            return jax.jvp(function, (z,), (a,))
-
-        (value, first), (_, second) = jax.jvp(along_a, (z,), (b,))
-        return value, first, second
-
-    return jax.vmap(at)
 
 
 def _sample_map(case: Case, task: DesignTask) -> Any:

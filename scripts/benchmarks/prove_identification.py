@@ -79,18 +79,20 @@ def prepared() -> tuple[DesignTask, Array]:
     return DesignTask.resolve(stated, threads=1), control
 
 
-def recorded(
-    task: DesignTask, theta: Array, control: Array, friction: float, rng: np.random.Generator
-) -> Recording:
-    """Play the control on the robot.
+def run(seed: int, number: int, friction: float) -> Outcome:
+    """Play and identify one robot with a friction [N]."""
+    task, control = prepared()
+    rng = np.random.default_rng([seed, number])
 
-    Args:
-        task: The task as the user states it.
-        theta: (p,) true values of all unknowns.
-        control: (N, nu) control.
-        friction: Dry friction in the slide [N].
-        rng: Source of random numbers.
-    """
+    # True values of start, biases and delay.
+    names = list(task.parameters.names)
+    theta = np.array(task.parameters.true)
+    starts = [i for i, name in enumerate(names) if name.startswith("initial")]
+    theta[starts] = rng.normal(0.0, START_DEVIATION, len(starts))
+    for output, bias in BIAS.items():
+        theta[names.index(f"bias {output}")] = bias
+    theta[names.index("delay")] = DELAY
+
     model = task.system.model_at(theta)
     model.opt.timestep = STEP
     model.dof_frictionloss[int(model.joint("slide").dofadr[0])] = friction
@@ -116,23 +118,8 @@ def recorded(
     outputs = task.system.outputs
     biases = task.parameters.bias_derivative(len(outputs)) @ theta
     y = np.array(states)[rows] + biases + rng.normal(0.0, SIGMA, (N + 1, len(outputs)))
-    return Recording(t=times, ctrl=control, y=y, outputs=outputs.names, name="robot")
-
-
-def run(seed: int, number: int, friction: float) -> Outcome:
-    """Play and identify one robot with a friction [N]."""
-    task, control = prepared()
-    rng = np.random.default_rng([seed, number])
-
-    # True values of start, biases and delay.
-    names = list(task.parameters.names)
-    theta = np.array(task.parameters.true)
-    starts = [i for i, name in enumerate(names) if name.startswith("initial")]
-    theta[starts] = rng.normal(0.0, START_DEVIATION, len(starts))
-    for output, bias in BIAS.items():
-        theta[names.index(f"bias {output}")] = bias
-    theta[names.index("delay")] = DELAY
-    found = identify_system(task.system, [recorded(task, theta, control, friction, rng)])
+    log = Recording(t=times, ctrl=control, y=y, outputs=outputs.names, name="robot")
+    found = identify_system(task.system, [log])
     low, high = found.interval.T
 
     # Terms are sorted by how much they explain.
