@@ -7,15 +7,11 @@ cylinders. Both have position servos, rotor inertias and sensors of the torques 
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import mujoco
 import numpy as np
 
 from mjfim.arrays import Array, record
-
-# Folder of the models that others wrote, beside the repository.
-MODELS = Path(__file__).resolve().parents[3] / "shared" / "models"
+from scripts.benchmarks.child import SHARED
 
 # Period of the controller and of the engine [s].
 TIMESTEP = 0.002
@@ -34,8 +30,6 @@ class Arm:
         range: (n,) largest distances from them [rad].
         friction: (n,) typical dry friction [N m] and viscous friction [N m s/rad].
         sigma: (n,) standard deviations of the measured torques [N m].
-        gains: (n, 2) gains [N m/rad] and [N m s/rad] of the discrete laws of its drivers, whose
-            motors take torques; None where the model has servos.
     """
 
     name: str
@@ -46,7 +40,6 @@ class Arm:
     range: Array
     friction: Array
     sigma: Array
-    gains: Array | None = None
 
 
 def with_sensors(spec: mujoco.MjSpec) -> str:
@@ -65,7 +58,7 @@ def with_sensors(spec: mujoco.MjSpec) -> str:
 
 def panda() -> Arm | None:
     """The Franka Emika Panda without its hand; None where its model is absent."""
-    path = MODELS / "menagerie_panda" / "panda_nohand_nomesh.xml"
+    path = SHARED / "models" / "menagerie_panda" / "panda_nohand_nomesh.xml"
     if not path.is_file():
         return None
     spec = mujoco.MjSpec.from_file(str(path))
@@ -86,53 +79,48 @@ def panda() -> Arm | None:
     )
 
 
-# Denavit-Hartenberg parameters of the UR5e: a [m], d [m] and alpha [rad].
-UR_A = (0.0, -0.425, -0.3922, 0.0, 0.0, 0.0)
-UR_D = (0.1625, 0.0, 0.0, 0.1333, 0.0997, 0.0996)
-UR_ALPHA = (np.pi / 2, 0.0, 0.0, np.pi / 2, -np.pi / 2, 0.0)
+# Links of the UR5e by their joints: the Denavit-Hartenberg parameters a [m], d [m] and alpha [rad],
+# mass [kg], centre of mass in the frame at the end of the link [m], radius of the cylinder that
+# stands for it [m], rotor inertia [kg m^2], and gain of the servo [N m/rad].
+UR_LINKS = {
+    "shoulder_pan": (
+        (0.0, 0.1625, np.pi / 2),
+        (3.761, (0.0, -0.02561, 0.00193), 0.06, 0.6, 6000.0),
+    ),
+    "shoulder_lift": (
+        (-0.425, 0.0, 0.0),
+        (8.058, (0.2125, 0.0, 0.11336), 0.06, 0.6, 6000.0),
+    ),
+    "elbow": (
+        (-0.3922, 0.0, 0.0),
+        (2.846, (0.15, 0.0, 0.0265), 0.05, 0.6, 4000.0),
+    ),
+    "wrist_1": (
+        (0.0, 0.1333, np.pi / 2),
+        (1.37, (0.0, -0.0018, 0.01634), 0.045, 0.1, 800.0),
+    ),
+    "wrist_2": (
+        (0.0, 0.0997, -np.pi / 2),
+        (1.3, (0.0, 0.0018, 0.01634), 0.045, 0.1, 800.0),
+    ),
+    "wrist_3": (
+        (0.0, 0.0996, 0.0),
+        (0.365, (0.0, 0.0, -0.001159), 0.0375, 0.1, 800.0),
+    ),
+}
 
-# Masses of its links [kg], and their centres of mass in the frames at the ends of the links [m].
-UR_MASS = (3.761, 8.058, 2.846, 1.37, 1.3, 0.365)
-UR_COM = (
-    (0.0, -0.02561, 0.00193),
-    (0.2125, 0.0, 0.11336),
-    (0.15, 0.0, 0.0265),
-    (0.0, -0.0018, 0.01634),
-    (0.0, 0.0018, 0.01634),
-    (0.0, 0.0, -0.001159),
-)
 
-# Radii of the cylinders that stand for its links [m].
-UR_RADIUS = (0.06, 0.06, 0.05, 0.045, 0.045, 0.0375)
-
-# Its joints; rotor inertias [kg m^2], and gains [N m/rad] and [N m s/rad] of their servos.
-UR_JOINTS = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
-UR_ARMATURE = (0.6, 0.6, 0.6, 0.1, 0.1, 0.1)
-UR_KP = (6000.0, 6000.0, 4000.0, 800.0, 800.0, 800.0)
-UR_KV = (300.0, 300.0, 200.0, 40.0, 40.0, 40.0)
-
-
-# Name of the arm with discrete laws.
-LAWS = "UR5e, discrete laws"
-
-
-def ur5e(*, has_laws: bool = False) -> Arm:
-    """An arm with the dimensions and masses of a UR5e.
-
-    Args:
-        has_laws: Whether discrete laws move it in place of servos. These have half of the gains, so
-            that they are stable at their rate.
-    """
+def ur5e() -> Arm:
+    """An arm with the dimensions and masses of a UR5e."""
     spec = mujoco.MjSpec()
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     parent = spec.worldbody
     place, turn = np.zeros(3), 0.0
-    for i, joint in enumerate(UR_JOINTS):
-        a, d, alpha = UR_A[i], UR_D[i], UR_ALPHA[i]
+    for joint, ((a, d, alpha), (mass, com, radius, armature, gain)) in UR_LINKS.items():
         body = parent.add_body(
             name=f"link_{joint}", pos=place, quat=[np.cos(turn / 2), np.sin(turn / 2), 0.0, 0.0]
         )
-        body.add_joint(name=joint, axis=[0, 0, 1], armature=UR_ARMATURE[i])
+        body.add_joint(name=joint, axis=[0, 0, 1], armature=armature)
 
         # The frame of the link is at its end, turned about the direction of a.
         end = np.array([a, 0.0, d])
@@ -140,34 +128,27 @@ def ur5e(*, has_laws: bool = False) -> Arm:
             [[1, 0, 0], [0, np.cos(alpha), -np.sin(alpha)], [0, np.sin(alpha), np.cos(alpha)]]
         )
         body.explicitinertial = True
-        body.mass = UR_MASS[i]
-        body.ipos = end + turned @ np.array(UR_COM[i])
-        body.fullinertia = _cylinder(UR_MASS[i], UR_RADIUS[i], end)
+        body.mass = mass
+        body.ipos = end + turned @ np.array(com)
+
+        # A solid cylinder from the joint to the end.
+        length = float(np.linalg.norm(end))
+        along = end / length
+        across = mass * (3.0 * radius**2 + length**2) / 12.0
+        inertia = across * np.eye(3) + (0.5 * mass * radius**2 - across) * np.outer(along, along)
+        body.fullinertia = inertia[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
         parent, place, turn = body, end, alpha
         actuator = spec.add_actuator(name=joint, target=joint, trntype=mujoco.mjtTrn.mjTRN_JOINT)
-        if has_laws:
-            actuator.set_to_motor()
-        else:
-            actuator.set_to_position(kp=UR_KP[i], kv=UR_KV[i])
+        actuator.set_to_position(kp=gain, kv=gain / 20.0)
 
     large = np.arange(6) < 3
     return Arm(
-        name=LAWS if has_laws else "UR5e",
+        name="UR5e",
         xml=with_sensors(spec),
-        joints=UR_JOINTS,
-        links=tuple(f"link_{joint}" for joint in UR_JOINTS),
+        joints=tuple(UR_LINKS),
+        links=tuple(f"link_{joint}" for joint in UR_LINKS),
         home=np.array([0.0, -1.4, 1.2, -1.2, -1.3, 0.0]),
         range=np.array([1.5, 0.6, 0.9, 1.2, 1.2, 1.5]),
         friction=np.where(large, 6.0, 1.2),
         sigma=np.where(large, 0.6, 0.15),
-        gains=0.5 * np.array([UR_KP, UR_KV]).T if has_laws else None,
     )
-
-
-def _cylinder(mass: float, radius: float, axis: Array) -> Array:
-    """(6,) inertia of a solid cylinder about its centre of mass, in the order of MJCF [kg m^2]."""
-    length = float(np.linalg.norm(axis))
-    along = axis / length
-    across = mass * (3.0 * radius**2 + length**2) / 12.0
-    matrix = across * np.eye(3) + (0.5 * mass * radius**2 - across) * np.outer(along, along)
-    return matrix[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
