@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
@@ -43,14 +43,6 @@ def options_of(description: str | None, runs: int = 0) -> argparse.ArgumentParse
         parser.add_argument("--processes", type=int, default=cores(), help="runs side by side")
         parser.add_argument("-o", "--output", type=Path, help="JSON file with all outcomes")
     return parser
-
-
-def in_processes(
-    function: Callable[[Any], Any], jobs: Sequence[Any], processes: int | None = None
-) -> Iterator[Any]:
-    """Yield the results of a function for all jobs, in their order, with a bar of progress."""
-    with ProcessPoolExecutor(processes or cores(), mp_context=get_context("spawn")) as pool:
-        yield from track(pool.map(function, jobs), "runs", total=len(jobs))
 
 
 def study(

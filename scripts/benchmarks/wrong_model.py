@@ -24,25 +24,29 @@ from __future__ import annotations
 import time
 import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import asdict
-from pathlib import Path
 from typing import Any
 
 import mujoco
 import numpy as np
 from rich.console import Console
-from rich.table import Table
 
 import mjfim
 from mjfim.arrays import Array, record
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
-from mjfim.files import write_json
-from mjfim.parallel import cores
 from mjfim.parallel.budget import measured_by
 from mjfim.records.trajectory import Recording
 from mjfim.studies.compare import METHOD_TITLES, UNLIMITED_ITERATIONS
-from scripts.benchmarks.child import ROOT, in_processes, new_table, options_of
+from scripts.benchmarks.child import (
+    ROOT,
+    Outcome,
+    median,
+    options_of,
+    percent,
+    rms,
+    study,
+    table_of,
+)
 
 # Baselines, and the motion that is predicted.
 BASELINES = ("multisine", "fourier5")
@@ -158,155 +162,66 @@ ROBOTS = {
 }
 
 
-@record
-class Search:
-    """Order to search the motions of a robot.
+def true_robot(
+    robot: Robot, experiment: Experiment, rng: np.random.Generator
+) -> tuple[Array, Callable[[Array], Array]]:
+    """Draw a robot with what its model lacks.
 
-    Attributes:
-        robot: Name of the robot.
-        seconds: Time of the search of each motion [s].
+    Returns:
+        (p,) true parameters, and the function of (N, nu) commands to (N+1, ny) outputs without
+        noise, by MuJoCo's own steps.
     """
-
-    robot: str
-    seconds: float
-
-
-@record
-class Job:
-    """One robot that plays all motions.
-
-    Attributes:
-        robot: Name of the robot.
-        number: Number of the run, the seed of all that is random.
-        motions: (N, nu) controls by name.
-    """
-
-    robot: str
-    number: int
-    motions: dict[str, Array]
-
-
-@record
-class Truth:
-    """A simulated robot with what its model lacks.
-
-    Attributes:
-        system: The system with backlash.
-        theta: (p,) true parameters.
-        dofs: Degrees of freedom with friction.
-        friction: Dry friction of these at rest of the motor, without its Stribeck peak [N or N m].
-        peak: Height of the peak [N or N m].
-        speed: Stribeck speed [m/s or rad/s].
-        load: Dry friction over the torque of the motor.
-        delay: Delay of the commands [s].
-    """
-
-    system: System
-    theta: Array
-    dofs: np.ndarray
-    friction: Array
-    peak: Array
-    speed: float
-    load: float
-    delay: float
-
-    @classmethod
-    def of(cls, robot: Robot, experiment: Experiment, rng: np.random.Generator) -> Truth:
-        """Draw a robot."""
-        share = rng.uniform(*SHARES)
-        gaps = {
-            f"{joint}_backlash": {
-                "kind": "backlash",
-                "joint": joint,
-                "encoder": robot.encoder,
-                "values": {"gap": share * gap},
-            }
-            for joint, gap in robot.gap.items()
+    share = rng.uniform(*SHARES)
+    gaps = {
+        f"{joint}_backlash": {
+            "kind": "backlash",
+            "joint": joint,
+            "encoder": robot.encoder,
+            "values": {"gap": share * gap},
         }
-        system = System.resolve(experiment.replace(terms=gaps), threads=1)
-        guess = system.parameters.guess
-        theta = guess * (1.0 + WRONG * rng.uniform(-1.0, 1.0, len(guess)))
+        for joint, gap in robot.gap.items()
+    }
+    system = System.resolve(experiment.replace(terms=gaps), threads=1)
+    guess = system.parameters.guess
+    theta = guess * (1.0 + WRONG * rng.uniform(-1.0, 1.0, len(guess)))
 
+    model = system.model_at(theta)
+    dofs = np.array([int(model.joint(name).dofadr[0]) for name in robot.friction])
+    friction = rng.uniform(*SHARES, len(dofs)) * list(robot.friction.values())
+    at_rest = model.dof_frictionloss[dofs] + friction
+    peak = friction * rng.uniform(*PEAKS, len(dofs))
+    load, delay = (size * rng.uniform(*SHARES) for size in (robot.load, robot.delay))
+
+    def outputs(ctrl: Array) -> Array:
         model = system.model_at(theta)
-        dofs = np.array([int(model.joint(name).dofadr[0]) for name in robot.friction])
-        friction = rng.uniform(*SHARES, len(dofs)) * list(robot.friction.values())
-        return cls(
-            system=system,
-            theta=theta,
-            dofs=dofs,
-            friction=model.dof_frictionloss[dofs] + friction,
-            peak=friction * rng.uniform(*PEAKS, len(dofs)),
-            speed=robot.speed,
-            load=robot.load * rng.uniform(*SHARES),
-            delay=robot.delay * rng.uniform(*SHARES),
-        )
-
-    def outputs(self, ctrl: Array) -> Array:
-        """(N+1, ny) outputs without noise under (N, nu) commands, by MuJoCo's own steps."""
-        system = self.system
-        model = system.model_at(self.theta)
         model.opt.timestep /= FINER
-        model.dof_solimp[self.dofs, :2] = IMPEDANCE
+        model.dof_solimp[dofs, :2] = IMPEDANCE
         data = mujoco.MjData(model)
-        space = system.space
-        data.qpos[:], data.qvel[:], data.act[:] = space.split(
-            system.plant.initial_state(self.theta)
-        )
+        start = system.space.split(system.plant.initial_state(theta))
+        data.qpos[:], data.qvel[:], data.act[:] = start
 
         steps = FINER * system.grid.substeps
-        late = round(self.delay / model.opt.timestep)
+        late = round(delay / model.opt.timestep)
         found = []
-        for k in range(len(ctrl) + 1):
-            for i in range(k * steps, (k + 1) * steps):
-                sample = min((i - late) // steps, len(ctrl) - 1)
-                data.ctrl[:] = system.rest if sample < 0 else ctrl[sample]
-                if i == k * steps:
-                    mujoco.mj_forward(model, data)
-                    state = np.concatenate([data.qpos, data.qvel, data.act])
-                    found.append(
-                        [
-                            data.sensordata[o.sensor] if o.state is None else state[o.state]
-                            for o in system.outputs.outputs
-                        ]
-                    )
-                near_rest = np.exp(-((data.qvel[self.dofs] / self.speed) ** 2))
-                pressed = self.load * np.abs(data.qfrc_actuator[self.dofs])
-                model.dof_frictionloss[self.dofs] = self.friction + self.peak * near_rest + pressed
-                mujoco.mj_step(model, data)
+        for i in range((len(ctrl) + 1) * steps):
+            sample = min((i - late) // steps, len(ctrl) - 1)
+            data.ctrl[:] = system.rest if sample < 0 else ctrl[sample]
+            if i % steps == 0:
+                mujoco.mj_forward(model, data)
+                state = np.concatenate([data.qpos, data.qvel, data.act])
+                found.append(
+                    [
+                        data.sensordata[o.sensor] if o.state is None else state[o.state]
+                        for o in system.outputs.outputs
+                    ]
+                )
+            near_rest = np.exp(-((data.qvel[dofs] / robot.speed) ** 2))
+            pressed = load * np.abs(data.qfrc_actuator[dofs])
+            model.dof_frictionloss[dofs] = at_rest + peak * near_rest + pressed
+            mujoco.mj_step(model, data)
         return np.array(found)
 
-
-@record
-class Outcome:
-    """Outcome of one motion of one robot, fitted with one experiment.
-
-    Attributes:
-        robot: Name of the robot.
-        number: Number of the run.
-        fit: Name of the experiment.
-        motion: Name of the motion.
-        errors: (t,) relative errors of the wanted parameters.
-        widths: (t,) half widths of their 95 % intervals, relative to the true values.
-        prediction: Error of the prediction of the held-out motion [σ].
-    """
-
-    robot: str
-    number: int
-    fit: str
-    motion: str
-    errors: Array
-    widths: Array
-    prediction: float
-
-    @property
-    def error(self) -> float:
-        """Root mean square of the relative errors."""
-        return float(np.sqrt(np.mean(self.errors**2)))
-
-    @property
-    def shares(self) -> Array:
-        """(t,) errors over the half widths of the intervals."""
-        return np.abs(self.errors) / self.widths
+    return theta, outputs
 
 
 def experiments_of(robot: Robot) -> dict[str, Experiment]:
@@ -318,37 +233,46 @@ def experiments_of(robot: Robot) -> dict[str, Experiment]:
     return {PLAIN: plain, CURED: plain.replace(nuisance=nuisance)}
 
 
-def search(order: Search) -> dict[str, Array]:
+def search(robot: str, seconds: float) -> dict[str, Array]:
     """Search motions in equal time within equal limits; controls (N, nu) by name."""
     warnings.simplefilter("ignore")
-    experiments = experiments_of(ROBOTS[order.robot])
+    experiments = experiments_of(ROBOTS[robot])
     methods = [*BASELINES, HELD_OUT]
-    descent = {"seconds": order.seconds, "max_iterations": UNLIMITED_ITERATIONS}
+    descent = {"seconds": seconds, "max_iterations": UNLIMITED_ITERATIONS}
     with measured_by(time.process_time):
         found = mjfim.compare(
-            experiments[PLAIN], seconds=order.seconds, methods=methods, threads=1, progress=False
+            experiments[PLAIN], seconds=seconds, methods=methods, threads=1, progress=False
         )
         cured = mjfim.design(experiments[CURED].replace(descent=descent), threads=1, progress=False)
     motions = {row.method: row.control for row in found.rows if row.control is not None}
     return {**motions, CURED: cured.trajectory.ctrl}
 
 
-def run(job: Job) -> list[Outcome]:
-    """Record, fit and predict all motions of one robot."""
+def run(name: str, number: int, motions: dict[str, Array]) -> Sequence[Outcome]:
+    """Record, fit and predict all motions of one robot.
+
+    Args:
+        name: Name of the robot.
+        number: Number of the run, the seed of all that is random.
+        motions: (N, nu) controls by name.
+    """
     warnings.simplefilter("ignore")
-    robot, motions = ROBOTS[job.robot], dict(job.motions)
+    robot = ROBOTS[name]
     experiments = experiments_of(robot)
     system = System.resolve(experiments[PLAIN], threads=1)
-    truth = Truth.of(robot, experiments[PLAIN], np.random.default_rng([job.number, 0]))
+    rng = np.random.default_rng([number, 0])
+    theta, outputs = true_robot(robot, experiments[PLAIN], rng)
     wanted = system.parameters.interest
-    true = truth.theta[wanted]
+    true = theta[wanted]
 
-    held = motions.pop(HELD_OUT)
-    robot_moves = truth.outputs(held)
-    found = []
+    held = motions[HELD_OUT]
+    robot_moves = outputs(held)
+    found: list[dict[str, Any]] = []
     for motion, ctrl in motions.items():
-        y = truth.outputs(ctrl)
-        noise = system.noise.sample(len(y), np.random.default_rng([job.number, 1]))
+        if motion == HELD_OUT:
+            continue
+        y = outputs(ctrl)
+        noise = system.noise.sample(len(y), np.random.default_rng([number, 1]))
         t = system.dt * np.arange(len(y), dtype=np.float64)
         names = system.outputs.names
         recording = Recording(t=t, ctrl=ctrl, y=y + noise, outputs=names, name=motion)
@@ -362,97 +286,60 @@ def run(job: Job) -> list[Outcome]:
             )
             fitted = System.resolve(experiment, threads=1)
             predicted = fitted.plant.measure(estimate.theta[None], held)[0][0]
-            errors = (predicted - robot_moves) / system.noise.sigma
+            errors = np.abs(estimate.theta[wanted] - true)
+            shares = errors / (0.5 * np.ptp(estimate.interval[wanted], axis=1))
             found.append(
-                Outcome(
-                    robot=job.robot,
-                    number=job.number,
-                    fit=fit,
-                    motion=motion,
-                    errors=(estimate.theta[wanted] - true) / np.abs(true),
-                    widths=0.5 * np.ptp(estimate.interval[wanted], axis=1) / np.abs(true),
-                    prediction=float(np.sqrt(np.mean(errors**2))),
-                )
+                {
+                    "robot": name,
+                    "fit": fit,
+                    "motion": f"design {CURED}" if motion == CURED else METHOD_TITLES[motion],
+                    "baseline": motion in BASELINES,
+                    "error": 100.0 * rms(errors / np.abs(true)),
+                    "prediction": rms((predicted - robot_moves) / system.noise.sigma),
+                    "shares": shares,
+                    "inside": shares <= 1.0,
+                }
             )
+    # Whether a design is at least as good as both baselines.
+    for key in ("error", "prediction"):
+        for each in found:
+            others = [other for other in found if other["baseline"] and other["fit"] == each["fit"]]
+            is_least = all(each[key] <= other[key] for other in others)
+            each[f"least {key}"] = [] if each["baseline"] else [is_least]
     return found
-
-
-def share_as_good(group: Sequence[Outcome], motion: str, value: Callable[[Outcome], float]) -> str:
-    """Share of the robots on which a motion is at least as good as both baselines, in percent."""
-    values = {(each.number, each.motion): value(each) for each in group}
-    numbers = {each.number for each in group}
-    flags = [
-        all(values[i, motion] <= values[i, baseline] for baseline in BASELINES) for i in numbers
-    ]
-    return f"{100.0 * np.mean(flags):.0f} %"
-
-
-def table_of(outcomes: Sequence[Outcome]) -> Table:
-    """Medians over the runs of each robot, fit and motion."""
-    table = new_table(
-        "Robots with friction, backlash and delay that the model lacks: medians over the robots",
-        "robot",
-        "fit",
-        "motion",
-        "error",
-        "least error",
-        "held out",
-        "least held out",
-        "error / interval",
-        "inside",
-        texts=3,
-    )
-    places = dict.fromkeys((each.robot, each.fit) for each in outcomes)
-    for robot, fit in places:
-        group = [each for each in outcomes if (each.robot, each.fit) == (robot, fit)]
-        for motion in dict.fromkeys(each.motion for each in group):
-            rows = [each for each in group if each.motion == motion]
-            is_baseline = motion in BASELINES
-            shares = np.concatenate([each.shares for each in rows])
-            table.add_row(
-                robot,
-                fit,
-                f"design {CURED}" if motion == CURED else METHOD_TITLES[motion],
-                f"{100.0 * np.median([each.error for each in rows]):.1f} %",
-                "" if is_baseline else share_as_good(group, motion, lambda each: each.error),
-                f"{np.median([each.prediction for each in rows]):.2f} σ",
-                "" if is_baseline else share_as_good(group, motion, lambda each: each.prediction),
-                f"{np.median(shares):.2f}",
-                f"{100.0 * np.mean(shares <= 1.0):.0f} %",
-            )
-    return table
 
 
 def main() -> int:
     """Print the medians over the runs."""
-    parser = options_of(__doc__)
-    parser.add_argument("--runs", type=int, default=10, help="robots of each kind")
+    parser = options_of(__doc__, runs=10)
     parser.add_argument(
         "--seconds", type=float, default=20.0, help="processor seconds of each search"
     )
     parser.add_argument("--robots", nargs="+", choices=list(ROBOTS), default=list(ROBOTS))
-    parser.add_argument("--processes", type=int, default=cores())
-    parser.add_argument("-o", "--output", type=Path, help="JSON file with all runs")
     args = parser.parse_args()
 
-    clock = time.perf_counter()
-    orders = [Search(robot=name, seconds=args.seconds) for name in args.robots]
-    motions = list(in_processes(search, orders, args.processes))
+    orders = [(name, args.seconds) for name in args.robots]
+    motions = study(search, orders, args.processes)
     jobs = [
-        Job(robot=name, number=number, motions=controls)
-        for number in range(args.runs)
+        (name, number, controls)
+        for number in range(args.seed, args.seed + args.runs)
         for name, controls in zip(args.robots, motions, strict=True)
     ]
-    outcomes: list[Outcome] = []
-    for found in in_processes(run, jobs, args.processes):
-        outcomes += found
-        if args.output is not None:
-            write_json(args.output, {"runs": [asdict(each) for each in outcomes]})
-
+    found = study(run, jobs, args.processes, args.output)
+    columns = {
+        "error [%]": median("error", ".1f"),
+        "least error": percent("least error"),
+        "held out [σ]": median("prediction", ".2f"),
+        "least held out": percent("least prediction"),
+        "error / interval": median("shares", ".2f"),
+        "inside": percent("inside"),
+    }
     console = Console(width=160)
-    console.print(table_of(outcomes))
+    title = "Robots with friction, backlash and delay that the model lacks: medians over the robots"
+    outcomes = [each for outcomes in found for each in outcomes]
+    outcomes.sort(key=lambda each: (each["robot"], each["fit"]))
+    console.print(table_of(title, outcomes, ("robot", "fit", "motion"), columns))
     console.print(
         "least: share of the robots on which the design errs at most as both baselines do"
     )
-    console.print(f"{time.perf_counter() - clock:.0f} s in {args.processes} processes")
     return 0
