@@ -27,9 +27,8 @@ import mjfim
 from mjfim.arrays import record
 from mjfim.experiment.system import System
 from mjfim.identification.identify import identify_system
-from mjfim.recordings.read import read_recording
 from mjfim.records.estimate import Estimate
-from scripts.benchmarks.child import ROOT, new_table, options_of
+from scripts.benchmarks.child import ROOT, SHARED, new_table, options_of
 from scripts.benchmarks.measured_data import SERVO_TIMES, SETS, servo_files
 
 # Logs of the measured robots, by the name of their experiment.
@@ -115,54 +114,47 @@ def simulated_log(robot: SimulatedRobot, system: System, number: int) -> mjfim.R
     rng = np.random.default_rng(number)
     model = system.model_at(system.parameters.true)
     data = mujoco.MjData(model)
-    mujoco.mj_resetData(model, data)
-    state = system.plant.nominal_initial_state
-    data.qpos[:] = state[: model.nq]
-    dofs = model.jnt_dofadr[model.actuator_trnid[:, 0]]
-    places = model.jnt_qposadr[model.actuator_trnid[:, 0]]
-    names = [model.joint(j).name for j in model.actuator_trnid[:, 0]]
-    static = np.array([robot.static[name] for name in names])
-    load = np.array([robot.load[name] for name in names])
+    data.qpos[:] = system.plant.nominal_initial_state[: model.nq]
+    joints = model.actuator_trnid[:, 0]
+    dofs, places = model.jnt_dofadr[joints], model.jnt_qposadr[joints]
+    names = [model.joint(j).name for j in joints]
+    static, load = (np.array([each[k] for k in names]) for each in (robot.static, robot.load))
     coulomb = np.array(model.dof_frictionloss[dofs])
+    is_limited = model.actuator_ctrllimited.astype(bool)
+    low, high = np.where(is_limited, model.actuator_ctrlrange.T, [[-np.inf], [np.inf]])
 
     # References are multisines about the start. The stiffness is that over the inertia there.
     mujoco.mj_forward(model, data)
     M = np.zeros((model.nv, model.nv))
     mujoco.mj_fullM(model, data, M)
+    inertia = np.diag(M)[dofs]
     stiffness, ratio = GAINS[number % len(GAINS)]
-    kp = stiffness * np.diag(M)[dofs]
-    kd = 2.0 * ratio * np.sqrt(stiffness) * np.diag(M)[dofs]
+    kp, kd = stiffness * inertia, 2.0 * ratio * np.sqrt(stiffness) * inertia
     frequencies = rng.uniform(0.2, 1.5, (3, len(dofs)))
     phases = rng.uniform(0.0, 2.0 * np.pi, (3, len(dofs)))
     center = np.array(data.qpos[places])
 
-    sigma = system.noise.sigma
-    steps = round(system.dt / model.opt.timestep)
-    count = round(SECONDS / system.dt)
-    ctrl, rows = np.zeros((count, model.nu)), np.zeros((count + 1, model.nq + model.nv))
-    for k in range(count + 1):
-        rows[k] = np.concatenate([data.qpos, data.qvel])
-        if k == count:
-            break
+    t = np.arange(round(SECONDS / system.dt) + 1, dtype=np.float64) * system.dt
+    ctrl, rows = [], [np.concatenate([data.qpos, data.qvel])]
+    for k in range(len(t) - 1):
         waves = np.sin(2.0 * np.pi * frequencies * k * system.dt + phases) - np.sin(phases)
         reference = center + robot.amplitude / 3.0 * waves.sum(axis=0)
         force = kp * (reference - data.qpos[places]) - kd * data.qvel[dofs]
-        low, high = model.actuator_ctrlrange.T
-        limited = model.actuator_ctrllimited.astype(bool)
-        ctrl[k] = np.where(limited, np.clip(force, low, high), force)
-        data.ctrl[:] = ctrl[k]
-        for _ in range(steps):
+        data.ctrl[:] = np.clip(force, low, high)
+        ctrl.append(np.array(data.ctrl))
+        for _ in range(round(system.dt / model.opt.timestep)):
             speed = data.qvel[dofs] / STRIBECK_SPEED
-            excess = static * np.exp(-(speed**2)) + load * np.abs(ctrl[k])
+            excess = static * np.exp(-(speed**2)) + load * np.abs(data.ctrl)
             model.dof_frictionloss[dofs] = coulomb + excess
             mujoco.mj_step(model, data)
+        rows.append(np.concatenate([data.qpos, data.qvel]))
 
     # Encoders and tachometers round to steps, whose error has the stated size.
-    y = rows[:, [output.state or 0 for output in system.outputs.outputs]]
-    step = np.sqrt(12.0) * sigma
+    y = np.array(rows)[:, [output.state or 0 for output in system.outputs.outputs]]
+    step = np.sqrt(12.0) * system.noise.sigma
     return mjfim.Recording(
-        t=np.arange(count + 1, dtype=np.float64) * system.dt,
-        ctrl=ctrl,
+        t=t,
+        ctrl=np.array(ctrl),
         y=step * np.round(y / step),
         outputs=system.outputs.names,
         name=f"log {number}, gains {stiffness:g} and {ratio:g}",
@@ -183,23 +175,6 @@ def halves(recording: mjfim.Recording) -> Iterator[mjfim.Recording]:
         )
 
 
-def restated(experiment: mjfim.Experiment, found: Estimate, folder: Path) -> mjfim.Experiment:
-    """The experiment at an estimate, which counts as `earlier`."""
-    found.save(folder)
-    system = System.resolve(experiment)
-    tables = {}
-    for name, value, own in zip(
-        found.parameters, found.theta, system.parameters.parameters, strict=True
-    ):
-        if name in experiment.parameters:
-            low, high = own.bounds
-            gap = min(GAP * max(abs(own.guess), own.scale), 0.25 * (high - low))
-            guess = float(np.clip(value, low + gap, high - gap))
-            tables[name] = {"guess": guess, "scale": own.scale}
-    earlier = (str(folder / "estimate.json"),)
-    return experiment.replace(parameters=tables, earlier=earlier)
-
-
 def overlap(first: Estimate, second: Estimate) -> np.ndarray:
     """Whether intervals overlap, for each parameter that both estimates determine."""
     asked = np.isin(first.parameters, first.nuisance, invert=True)
@@ -208,21 +183,13 @@ def overlap(first: Estimate, second: Estimate) -> np.ndarray:
     return np.asarray(low <= np.minimum(first.interval[:, 1], second.interval[:, 1]))[asked]
 
 
-def promised(experiment: mjfim.Experiment, recordings: Sequence[mjfim.Recording]) -> np.ndarray:
-    """(p,) standard deviations that `check` promises for recordings [theta-unit]."""
-    checked = mjfim.check(experiment, recordings, progress=False)
-    return np.array([row.std if not row.nuisance else np.nan for row in checked.rows])
-
-
 def share(flags: Sequence[bool]) -> str:
     """Share of true values in percent, and their number."""
     return f"{100.0 * float(np.mean(flags)):.0f} % of {len(flags)}" if flags else "-"
 
 
-def rows_of(
-    name: str, experiment: mjfim.Experiment, logs: Sequence[mjfim.Recording]
-) -> tuple[list[str], list[str]]:
-    """Rows of both tables for one robot."""
+def row_of(robot: str, experiment: mjfim.Experiment, logs: Sequence[mjfim.Recording]) -> list[str]:
+    """Row of the table for one robot."""
     clock = time.process_time()
     system = System.resolve(experiment)
     alone = [identify_system(system, [log]) for log in logs]
@@ -230,55 +197,66 @@ def rows_of(
     pairs = [overlap(a, b) for i, a in enumerate(alone) for b in alone[i + 1 :]]
     moved: set[str] = set()
 
-    ratios: dict[bool, list[float]] = {False: [], True: []}
+    ratios: tuple[list[float], list[float]] = ([], [])
     found = alone[0]
     for count in range(2, len(logs) + 1):
+        # The experiment at the estimate so far, which counts as `earlier`.
+        tables = {}
+        for name, value, own in zip(
+            found.parameters, found.theta, system.parameters.parameters, strict=True
+        ):
+            if name in experiment.parameters:
+                low, high = own.bounds
+                gap = min(GAP * max(abs(own.guess), own.scale), 0.25 * (high - low))
+                guess = float(np.clip(value, low + gap, high - gap))
+                tables[name] = {"guess": guess, "scale": own.scale}
         with tempfile.TemporaryDirectory() as folder:
-            later = restated(experiment, found, Path(folder))
-            promises = promised(experiment, logs[:count]), promised(later, logs[count - 1 : count])
+            found.save(folder)
+            earlier = (f"{folder}/estimate.json",)
+            later = experiment.replace(parameters=tables, earlier=earlier)
+            checks = (
+                mjfim.check(experiment, logs[:count], progress=False),
+                mjfim.check(later, logs[count - 1 : count], progress=False),
+            )
         found = identify_system(system, logs[:count])
         moved |= {sentence for sentence in found.warnings if "disagree" in sentence}
-        for has_earlier, promise in zip(ratios, promises, strict=True):
+        for each, check in zip(ratios, checks, strict=True):
+            promise = [np.nan if row.nuisance else row.std for row in check.rows]
             quotients = found.honest_std / promise
-            ratios[has_earlier] += quotients[np.isfinite(quotients)].tolist()
+            each += quotients[np.isfinite(quotients)].tolist()
     for sentence in sorted(moved):
-        print(f"{name}: {sentence}", flush=True)
+        print(f"{robot}: {sentence}", flush=True)
 
     cells = []
-    for each in ratios.values():
+    for each in ratios:
         kept = [KEPT[0] <= ratio <= KEPT[1] for ratio in each]
         span = f"{np.median(each):.2g} ({min(each):.2g} to {max(each):.2g})"
         cells += [share(kept), span]
     seconds = f"{(time.process_time() - clock) / 60.0:.1f}"
     agreed = [flag for each in pairs for flag in each.tolist()]
     of_halves = [flag for a, b in split for flag in overlap(a, b).tolist()]
-    return [name, *cells, seconds], [name, share(of_halves), share(agreed)]
+    return [robot, *cells, seconds, share(of_halves), share(agreed)]
 
 
 def main() -> int:
-    """Study every robot and print both tables."""
+    """Study every robot and print the table."""
     parser = options_of(__doc__)
-    parser.add_argument("--data", type=Path, default=ROOT.parent / "shared" / "data")
+    parser.add_argument("--data", type=Path, default=SHARED / "data")
     parser.add_argument("--only", help="name of one experiment")
     parser.add_argument("--logs", type=int, default=4, help="largest number of logs of a robot")
     args = parser.parse_args()
 
-    kept = new_table(
-        f"Honest σ over the promise; kept: {KEPT[0]:g} to {KEPT[1]:g}",
-        *("robot", "kept, before", "median (span), before"),
-        *("kept, with earlier logs", "median (span), with", "processor minutes"),
+    headings = "robot | kept, before | median (span), before | kept, with earlier logs"
+    headings += " | median (span), with | processor minutes | halves of a log | different motions"
+    title = (
+        f"Honest σ over the promise, kept from {KEPT[0]:g} to {KEPT[1]:g}; intervals that overlap"
     )
-    agree = new_table("Intervals that overlap", "robot", "halves of a log", "different motions")
-    jobs = []
+    table = new_table(title, *headings.split(" | "))
+    jobs: list[tuple[str, mjfim.Experiment, list[mjfim.Recording]]] = []
     for measured in {each.name: each for each in SETS}.values():
-        stated = mjfim.Experiment.from_file(ROOT / "models" / f"{measured.name}.toml").replace(
-            parameters={name: {"guess": value} for name, value in measured.published.items()}
-        )
         if args.only in (None, measured.name) and (args.data / measured.folder).is_dir():
-            channels = System.resolve(stated).channels
-            names = LOGS[measured.name][: args.logs]
-            paths = [args.data / measured.folder / name for name in names]
-            jobs.append((measured.name, stated, [read_recording(p, channels) for p in paths]))
+            logs = measured.read(args.data, LOGS[measured.name][: args.logs])
+            jobs.append((measured.name, measured.experiment(), logs))
     for robot in SIMULATED:
         if args.only in (None, robot.name):
             stated = mjfim.Experiment.from_file(ROOT / "models" / f"{robot.name}.toml")
@@ -288,9 +266,8 @@ def main() -> int:
             jobs.append((f"{robot.name}, simulated", stated, logs))
 
     for job in jobs:
-        first, second = rows_of(*job)
-        print(" | ".join(first), "||", " | ".join(second), flush=True)
-        kept.add_row(*first)
-        agree.add_row(*second)
-    Console(width=180).print(kept, agree)
+        row = row_of(*job)
+        print(" | ".join(row), flush=True)
+        table.add_row(*row)
+    Console(width=180).print(table)
     return 0
