@@ -13,22 +13,18 @@ from __future__ import annotations
 import gzip
 import json
 import time
-from collections.abc import Sequence
 from pathlib import Path
 
 import matplotlib.pyplot as plt
 import mujoco
 import numpy as np
-from matplotlib.figure import Figure
 from rich.console import Console
-from rich.table import Table
 
 import mjfim
 from mjfim.arrays import Array
 from mjfim.experiment.system import System
 from mjfim.recordings.read import read_recording
-from mjfim.records.estimate import Prediction
-from scripts.benchmarks.child import new_table, options_of
+from scripts.benchmarks.child import new_table, options_of, rms
 
 JOINTS = ["shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll", "gripper"]
 
@@ -152,11 +148,6 @@ def read_motion(folder: Path) -> Array:
     return np.hstack(columns)
 
 
-def rms(errors: Array, axis: int | None = None) -> Array:
-    """Return the root mean square [mrad] of errors [rad]."""
-    return np.asarray(1e3 * np.sqrt(np.mean(errors**2, axis=axis)))
-
-
 def published_rms(path: Path, numbers: str, motion: Array) -> Array:
     """Return the error [mrad] of a published set at its best delay."""
     model = mujoco.MjModel.from_xml_path(str(path))
@@ -170,61 +161,12 @@ def published_rms(path: Path, numbers: str, motion: Array) -> Array:
     for step, data.ctrl[:] in enumerate(motion[:, :6]):
         found[step] = data.qpos
         mujoco.mj_step(model, data, 5)
-    return min(rms(found[: len(found) - rows] - motion[rows:, 6:]) for rows in range(4))
+    return min(1e3 * rms(found[: len(found) - rows] - motion[rows:, 6:]) for rows in range(4))
 
 
 def numbers_of(row: str) -> Array:
     """Numbers of six joints in a row of `PUBLISHED`."""
     return np.broadcast_to([float(number) for number in row.split()], 6)
-
-
-def ratios_table(found: mjfim.Estimate) -> Table:
-    """Ratios that the motions determine, in the estimate and in the published sets.
-
-    Torques have no scale without a load, so that sets with other gains may move alike. Intervals
-    are those of the numerators.
-    """
-    heads = [f"{name} / kp [{unit}]" for name, (unit, _) in QUANTITIES.items()]
-    table = new_table(f"estimate | {', '.join(PUBLISHED)}", "joint", *heads)
-    places = {name: i for i, name in enumerate(found.parameters)}
-    published = [[numbers_of(row) for row in text.split("|")] for text in PUBLISHED.values()]
-    for number, joint in enumerate(JOINTS):
-        cells = []
-        for name, (_, scale) in QUANTITIES.items():
-            own = f"{name}_{joint}"
-            place = places[own if own in places else name]
-            value, (low, high) = found.theta[place], found.interval[place]
-            theirs = []
-            for gain, _, kd, armature, friction, damping in published:
-                top = {"damping": damping - kd, "friction": friction, "armature": armature}[name]
-                theirs.append(f"{scale * top[number] / gain[number]:.3g}")
-            value, low, high = scale * np.array([value, low, high]) / found.theta[places["kp"]]
-            ours = f"{value:.3g} ({low:.2g} to {high:.2g})"
-            cells.append(f"{ours} | {', '.join(theirs)}")
-        table.add_row(joint, *cells)
-    return table
-
-
-def draw_predictions(motions: Sequence[Array], predictions: Sequence[Prediction]) -> Figure:
-    """Draw the parts of `SHOWN`: measured angles, their references, and their predictions."""
-    figure, rows = plt.subplots(
-        2, len(motions), figsize=(13.0, 6.5), layout="constrained", squeeze=False
-    )
-    parts = zip(rows.T, SHOWN.items(), motions, predictions, strict=True)
-    for axes, (name, (joints, first, last)), motion, prediction in parts:
-        rows_shown = slice(first, last)
-        t = PERIOD * np.arange(first, last)
-        for axis, joint in zip(axes, joints, strict=True):
-            j = JOINTS.index(joint)
-            axis.plot(t, motion[rows_shown, j], color="0.5", lw=0.8, label="reference")
-            predicted = prediction.identified_outputs[rows_shown, j]
-            axis.plot(t, predicted, color="C0", lw=1.6, label="predicted")
-            axis.plot(t, motion[rows_shown, 6 + j], "k:", lw=1.4, label="measured")
-            axis.set_ylabel(f"{joint} [rad]")
-        axes[0].set_title(f"{name}, not fitted")
-        axes[-1].set_xlabel("time [s]")
-    rows[0, 0].legend(loc="upper right", ncols=3)
-    return figure
 
 
 def main() -> int:
@@ -277,12 +219,48 @@ def main() -> int:
     table = new_table("rms error [mrad]", "motion", "all", *JOINTS, *PUBLISHED)
     predictions = found.predictions[-len(motions) :]
     for (name, motion), prediction in zip(motions.items(), predictions, strict=True):
-        errors = prediction.identified_outputs - motion[:, 6:]
+        errors = 1e3 * (prediction.identified_outputs - motion[:, 6:])
         theirs = [published_rms(model, each, motion) for each in PUBLISHED.values()]
         table.add_row(name, *(f"{each:.1f}" for each in (rms(errors), *rms(errors, 0), *theirs)))
     console.print(table)
-    console.print(ratios_table(found))
-    shown = [predictions[list(motions).index(name)] for name in SHOWN]
-    figure = draw_predictions([motions[name] for name in SHOWN], shown)
+
+    # Ratios that the motions determine. Torques have no scale without a load, so that sets with
+    # other gains may move alike. Intervals are those of the numerators.
+    heads = [f"{name} / kp [{unit}]" for name, (unit, _) in QUANTITIES.items()]
+    ratios = new_table(f"estimate | {', '.join(PUBLISHED)}", "joint", *heads)
+    places = {name: i for i, name in enumerate(found.parameters)}
+    published = [[numbers_of(row) for row in text.split("|")] for text in PUBLISHED.values()]
+    for number, joint in enumerate(JOINTS):
+        cells = []
+        for name, (_, scale) in QUANTITIES.items():
+            own = f"{name}_{joint}"
+            place = places[own if own in places else name]
+            value, (low, high) = found.theta[place], found.interval[place]
+            others = []
+            for gain, _, kd, armature, friction, damping in published:
+                top = {"damping": damping - kd, "friction": friction, "armature": armature}[name]
+                others.append(f"{scale * top[number] / gain[number]:.3g}")
+            value, low, high = scale * np.array([value, low, high]) / found.theta[places["kp"]]
+            ours = f"{value:.3g} ({low:.2g} to {high:.2g})"
+            cells.append(f"{ours} | {', '.join(others)}")
+        ratios.add_row(joint, *cells)
+    console.print(ratios)
+
+    # The parts of `SHOWN`: measured angles, their references, and their predictions.
+    figure, rows = plt.subplots(
+        2, len(SHOWN), figsize=(13.0, 6.5), layout="constrained", squeeze=False
+    )
+    outputs_of = dict(zip(motions, (each.identified_outputs for each in predictions), strict=True))
+    for axes, (name, (joints, first, last)) in zip(rows.T, SHOWN.items(), strict=True):
+        t, motion = PERIOD * np.arange(first, last), motions[name][first:last]
+        for axis, joint in zip(axes, joints, strict=True):
+            j = JOINTS.index(joint)
+            axis.plot(t, motion[:, j], color="0.5", lw=0.8, label="reference")
+            axis.plot(t, outputs_of[name][first:last, j], color="C0", lw=1.6, label="predicted")
+            axis.plot(t, motion[:, 6 + j], "k:", lw=1.4, label="measured")
+            axis.set_ylabel(f"{joint} [rad]")
+        axes[0].set_title(f"{name}, not fitted")
+        axes[-1].set_xlabel("time [s]")
+    rows[0, 0].legend(loc="upper right", ncols=3)
     figure.savefig(output / "predictions.png", dpi=110)
     return 0
