@@ -31,9 +31,6 @@ from scripts.benchmarks.child import ROOT, new_table, options_of
 # Experiment of the study.
 EXPERIMENT = ROOT / "models" / "cart_pendulum.toml"
 
-# Rate of the measurements [Hz].
-RATE = 25.0
-
 
 # Numbers that the paper prints for each trajectory: the eigenvalues of the information and the cost
 # without weighted terms; then covariance of the Monte-Carlo estimates, Fisher information and
@@ -131,7 +128,7 @@ def main() -> None:
     # Tables II and III.
     curves = {"initial": design.initial.trajectory, "final": design.trajectory}
     study = mjfim.monte_carlo(
-        task.experiment, curves, trials=args.trials, seed=args.seed, measure_rate=RATE
+        task.experiment, curves, trials=args.trials, seed=args.seed, measure_rate=25.0
     )
     for name in PAPER:
         console.print(matrix_table(name, study))

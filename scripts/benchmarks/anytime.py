@@ -28,9 +28,6 @@ from mjfim.parallel.budget import measured_by
 from mjfim.records.studies import DESIGN
 from scripts.benchmarks.child import ROOT, kept, new_table, options_of
 
-# Folder of the examples.
-EXAMPLES = ROOT / "models"
-
 # Baselines that run without further wishes: the best ones of the whole list.
 METHODS = ("multisine", "fourier5", "fourier15", "splines")
 
@@ -79,7 +76,7 @@ def main() -> int:
     headings = [f"{seconds:g} s" for seconds in args.seconds]
     table = new_table(title, "experiment", "method", *headings, texts=2)
     tried: list[tuple[float, str, bool]] = []
-    for path in sorted(EXAMPLES.glob("*.toml")):
+    for path in sorted((ROOT / "models").glob("*.toml")):
         if args.examples is not None and path.stem not in args.examples:
             continue
         mine, theirs = [], []
@@ -89,16 +86,14 @@ def main() -> int:
                 partial(compute, path, seconds),
                 is_shown=args.show,
             )
-            if rows is None:
-                continue
-            costs = {row["method"]: row["cost"] for row in rows}
+            costs = {row["method"]: row["cost"] for row in rows or ()}
             own = costs.pop(DESIGN, np.inf)
             best, method = min(((J, method) for method, J in costs.items()), default=(np.inf, ""))
             is_beaten = best < (own - TIE * abs(own) if np.isfinite(own) else own)
-            tried.append((seconds, path.stem, is_beaten))
+            tried += [(seconds, path.stem, is_beaten)] * (rows is not None)
             mine.append(f"{own:.5g}{' [red]beaten[/red]' if is_beaten else ''}")
             theirs.append(f"{best:.5g} {method}")
-        if mine:
+        if tried and tried[-1][1] == path.stem:
             table.add_row(path.stem, "design", *mine)
             table.add_row("", "best baseline", *theirs)
             table.add_section()

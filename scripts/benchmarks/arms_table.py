@@ -29,9 +29,6 @@ from scripts.benchmarks.child import kept, options_of
 # Methods with five and with fifteen harmonics.
 FEW, MANY = "fourier5", "fourier15"
 
-# Frequency of the series that is one start of the design [Hz].
-FUNDAMENTAL = 0.2
-
 
 HEAD = """\
 | robot, friction of the joints | seconds | unknowns | 5 harmonics | 15 harmonics | mjfim | gain |
@@ -56,7 +53,8 @@ def run(
     """
     console.print(f"{arm}, {'dry' if dry else 'smooth'}, {horizon:g} s")
     stated = arms.experiment(arm, horizon, dry, args.folder / "models")
-    experiment = stated.replace(descent={"fourier": [FUNDAMENTAL], "max_iterations": 100_000})
+    # One start of the design is a series at 0.2 Hz.
+    experiment = stated.replace(descent={"fourier": [0.2], "max_iterations": 100_000})
     with mjfim.Pool() as executor:
         found = mjfim.compare(
             experiment, seconds=args.seconds, methods=[FEW, MANY], executor=executor

@@ -28,9 +28,6 @@ from scripts.benchmarks.child import ROOT, SHARED, options_of
 from scripts.benchmarks.golden_cases import CASES
 from scripts.verbs import call_verb
 
-# Longest time of a command [s].
-PATIENCE = 3600.0
-
 # Times differ between runs; states are the only texts that are compared.
 TIMES = frozenset({"seconds", "times", "wall", "elapsed", "created"})
 STATES = frozenset({"status", "level", "state", "found_by", "method", "schema_version"})
@@ -90,7 +87,7 @@ def run_case(text: str, tree: Path) -> dict[str, Any]:
         for line in text.split(" ; "):
             words = [edited(word, folder) for word in shlex.split(line)]
             variables = {"PYTHONPATH": str(tree), "MPLBACKEND": "Agg", "COLUMNS": "120"}
-            ended = call_verb(words, variables=variables, patience=PATIENCE, folder=folder)
+            ended = call_verb(words, variables=variables, patience=3600.0, folder=folder)
             codes.append(ended.returncode)
             if ended.returncode:
                 errors.append(" ".join(ended.stderr.strip().splitlines())[-200:])

@@ -48,9 +48,6 @@ HORIZON = 4.0
 # Control of all recordings.
 CONTROL = {"kind": "multisine", "amplitude": 4.0, "frequency": 0.4, "harmonics": 6}
 
-# Name of the missing term among the parameters of the robot.
-MISSING = "missing"
-
 # Kinds of terms that the model lacks: path of the parameter, smallest and largest size [unit of the
 # path]. They change the motion by a few standard deviations of the noise at least.
 STRIBECK, ASYMMETRIC = (
@@ -124,7 +121,7 @@ def run(seed: int, number: int, lacks: bool) -> Outcome:
             value = float(rng.uniform(low, high))
             missing = {"target": path, "guess": value, "true": value}
             terms = TERMS.get(words, {})
-            robot = experiment.replace(terms=terms, parameters={MISSING: missing})
+            robot = experiment.replace(terms=terms, parameters={"missing": missing})
 
         # The last parameter of the robot is the one that the experiment lacks.
         task = DesignTask.resolve(robot, threads=1)
