@@ -9,6 +9,7 @@ and records take the labels of its joints, controls, parameters and outputs.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -29,7 +30,7 @@ from mjfim.experiment.schema import Experiment, ExperimentLike, experiment_of
 from mjfim.experiment.stated_units import require_units
 from mjfim.experiment.time_grid import TimeGrid, noise_strides
 from mjfim.model.clearance import with_floor
-from mjfim.model.control_laws import ControlLaws
+from mjfim.model.control_laws import FIELDS, ControlLaws, law_unit
 from mjfim.model.coordinates import (
     ScalarJoint,
     control_labels,
@@ -42,7 +43,7 @@ from mjfim.model.parameter_writer import MOMENT_ROUNDING, ParameterWriter
 from mjfim.model.parameters import ParameterSet
 from mjfim.model.terms.library import KINDS
 from mjfim.model.terms.term import ELEMENT_KEYS, Term, TermTable
-from mjfim.model.units import per_second
+from mjfim.model.units import FORCE_UNITS, control_unit, per_second
 from mjfim.model.variants import STATED, MocapPlacement, ModelVariant, PlantModel, Relaxation
 from mjfim.parallel import require_threads
 from mjfim.plant.batch import state_space
@@ -50,6 +51,7 @@ from mjfim.plant.outputs import Noise, Outputs
 from mjfim.plant.plant import Plant
 from mjfim.plant.state_space import StateSpace
 from mjfim.recordings.channels import Channels
+from mjfim.records.estimate import ControlLawInLoop
 from mjfim.records.trajectory import Labels, Recording, Trajectory
 
 
@@ -614,6 +616,68 @@ def labels_of_model(model: mujoco.MjModel) -> Labels:
         velocities=tuple(f"{name} velocity [{per_second(unit)}]" for name, unit in units.items()),
         controls=control_labels(model),
     )
+
+
+# Numbers with which a law is more than a position servo, unless they have no effect.
+BEYOND_SERVOS = {
+    "ki",
+    "slew",
+    "latency",
+    "time_constant",
+    "feedback_latency",
+    "velocity_time_constant",
+    "acceleration",
+}
+
+
+def laws_in_loop(
+    system: System, theta: Array, clipped: Mapping[str, float]
+) -> tuple[ControlLawInLoop, ...]:
+    """Describe the laws at some parameters.
+
+    Args:
+        system: The system.
+        theta: (p,) parameters [theta-unit].
+        clipped: Share of the samples at which the limits of a law clip its control, by actuator.
+
+    Returns:
+        The laws; none where logs hold the controls themselves.
+    """
+    if system.laws is None:
+        return ()
+    model = system.plant.model(theta)
+    paths = {target.path for p in system.parameters.parameters for target in p.targets}
+    found = []
+    for law in system.laws.laws:
+        values = law.numbers(model)
+        numbers: dict[str, float] = {}
+        units: dict[str, str] = {}
+        for field, names in FIELDS.items():
+            is_end = len(names) > 1
+            for i, name in enumerate(names):
+                key = f"{field}[{i}]" if is_end else field
+                if np.isfinite(values[name]) and (is_end or values[name] != 0.0):
+                    numbers[key] = values[name]
+                    units[key] = law_unit(model, law.actuator, field)
+
+        plain = BEYOND_SERVOS.isdisjoint(numbers) and not law.differences
+        unit = control_unit(model, int(model.actuator(law.actuator).id))
+        is_servo = plain and unit in FORCE_UNITS.values() and set(law.columns) == {"reference"}
+        estimated = (key for key in numbers if f"controller/{law.actuator}:{key}" in paths)
+        found.append(
+            ControlLawInLoop(
+                actuator=law.actuator,
+                joint=law.joint,
+                rate=1.0 / (law.tick * float(model.opt.timestep)),
+                columns=tuple(system.laws.columns[i] for i in law.columns.values()),
+                numbers=numbers,
+                units=units,
+                estimated=tuple(estimated),
+                clipped=clipped.get(law.actuator, 0.0),
+                is_servo=is_servo,
+            )
+        )
+    return tuple(found)
 
 
 def labels_of_system(system: System) -> Labels:

@@ -378,10 +378,14 @@ def _beyond_stops(search: FitSearch, fit: FitResult) -> FitResult:
     """
     touches = touched_in(fit) if is_doubtful(fit) or fit.solution.stuck else ""
     for _ in range(MAX_TOUCH_ROUNDS if touches else 0):
+        cost = fit.solution.cost
         start = start_beyond_stops(search, fit) if is_doubtful(fit) else None
         if start is None or search.interrupted:
             break
         fit = _fitted_from(search, fit.problem, start, "all data, beyond stops", fit) or fit
+        # After a small gain, further rounds of searches take long and gain even less.
+        if fit.solution.cost > (1.0 - MISSED_ROUGH_SHARE) * cost:
+            break
     if touches and fit.solution.stuck and not is_doubtful(fit):
         # Differences that straddle the jump are no slopes. The minimum may be at the jump itself.
         finer = fit.problem.with_longer_differences(SHORTER_DIFFERENCES)

@@ -15,8 +15,7 @@ from mjfim.excitation.limits.limits import Limit, limits_of, limits_of_model, un
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.stated_units import probable_degrees
-from mjfim.experiment.system import System
-from mjfim.identification.assessment.report import laws_in_loop
+from mjfim.experiment.system import System, laws_in_loop
 from mjfim.model.elements import identifier, names_of, unique_names, unnamed_count
 from mjfim.model.given import packed
 from mjfim.model.loading import ModelSource

@@ -1,6 +1,7 @@
 """Does the promised accuracy come true, and do two logs of one robot give one answer?
 
     python -m scripts.benchmarks promise [--data ../shared/data] [--only NAME] [--logs 4]
+    python -m scripts.benchmarks promise --experiment FILE.toml LOG.csv ... [--seconds 12]
 
 Each log of a robot is fitted alone, and so are its two halves. From the second log on, `check`
 promises σ after all logs so far: by the stated noise at the guess, and with the estimate of the
@@ -27,6 +28,7 @@ import mjfim
 from mjfim.arrays import record
 from mjfim.experiment.system import System
 from mjfim.identification.identify import identify_system
+from mjfim.recordings.read import read_recording
 from mjfim.records.estimate import Estimate
 from scripts.benchmarks.child import ROOT, SHARED, new_table, options_of
 from scripts.benchmarks.measured_data import SERVO_TIMES, SETS, servo_files
@@ -161,18 +163,19 @@ def simulated_log(robot: SimulatedRobot, system: System, number: int) -> mjfim.R
     )
 
 
+def part_of(recording: mjfim.Recording, rows: slice, name: str) -> mjfim.Recording:
+    """Some rows of a recording."""
+    t = recording.t[rows]
+    return replace(
+        recording, t=t - t[0], ctrl=recording.ctrl[rows][: len(t)], y=recording.y[rows], name=name
+    )
+
+
 def halves(recording: mjfim.Recording) -> Iterator[mjfim.Recording]:
     """The two halves of a recording."""
     middle = len(recording.t) // 2
-    for place, name in ((slice(None, middle), "first half"), (slice(middle, None), "second half")):
-        t = recording.t[place]
-        yield replace(
-            recording,
-            t=t - t[0],
-            ctrl=recording.ctrl[place][: len(t)],
-            y=recording.y[place],
-            name=f"{recording.name}, {name}",
-        )
+    yield part_of(recording, slice(None, middle), f"{recording.name}, first half")
+    yield part_of(recording, slice(middle, None), f"{recording.name}, second half")
 
 
 def overlap(first: Estimate, second: Estimate) -> np.ndarray:
@@ -244,6 +247,9 @@ def main() -> int:
     parser.add_argument("--data", type=Path, default=SHARED / "data")
     parser.add_argument("--only", help="name of one experiment")
     parser.add_argument("--logs", type=int, default=4, help="largest number of logs of a robot")
+    parser.add_argument("--experiment", type=Path, help="file of one robot, whose logs follow")
+    parser.add_argument("files", type=Path, nargs="*", help="its logs")
+    parser.add_argument("--seconds", type=float, default=np.inf, help="beginning of its logs")
     args = parser.parse_args()
 
     headings = "robot | kept, before | median (span), before | kept, with earlier logs"
@@ -253,6 +259,14 @@ def main() -> int:
     )
     table = new_table(title, *headings.split(" | "))
     jobs: list[tuple[str, mjfim.Experiment, list[mjfim.Recording]]] = []
+    if args.experiment is not None:
+        stated = mjfim.Experiment.from_file(args.experiment)
+        channels = System.resolve(stated).channels
+        read = [read_recording(path, channels) for path in args.files]
+        rows = [slice(int(np.searchsorted(each.t - each.t[0], args.seconds))) for each in read]
+        logs = [part_of(log, cut, log.name) for log, cut in zip(read, rows, strict=True)]
+        jobs.append((args.experiment.stem, stated, logs))
+        args.only = args.experiment.stem
     for measured in {each.name: each for each in SETS}.values():
         if args.only in (None, measured.name) and (args.data / measured.folder).is_dir():
             logs = measured.read(args.data, LOGS[measured.name][: args.logs])

@@ -272,7 +272,6 @@ def test_a_path_stands_for_the_experiment_and_a_design_for_its_motion() -> None:
     checked = mjfim.check(file, trajectory=design, progress=False)
     assert checked.source == "the given trajectory"
     assert list(mjfim.monte_carlo(file, design, trials=4, progress=False).sets) == ["final"]
-    assert design.seconds < 10.0
 
 
 def test_the_initial_motion_is_the_default(system: System) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,7 +13,7 @@ import scipy
 from mjfim.arrays import UNDETERMINED_SHARE, Array
 from mjfim.errors import MjfimError, first_ones, listed
 from mjfim.experiment.stated_units import probable_degrees
-from mjfim.experiment.system import System, labels_of_system
+from mjfim.experiment.system import labels_of_system, laws_in_loop
 from mjfim.identification.aligned_recording import changes_within_samples
 from mjfim.identification.assessment.accuracy import FitResult
 from mjfim.identification.assessment.honest_covariance import with_honest_covariance
@@ -31,15 +31,12 @@ from mjfim.identification.inverse_dynamics import residual_forces
 from mjfim.identification.left_out import predict_unfitted
 from mjfim.identification.linear_coordinates import CadPrior
 from mjfim.identification.search import values_of_start
-from mjfim.model.control_laws import FIELDS, law_unit
 from mjfim.model.parameters import ParameterSet
-from mjfim.model.units import FORCE_UNITS, control_unit
 from mjfim.parallel.budget import Budget
 from mjfim.plant.outputs import Noise
 from mjfim.recordings.checks import plausibility_remarks
 from mjfim.records.estimate import (
     MAX_NOMINAL_ROWS,
-    ControlLawInLoop,
     Estimate,
     Prediction,
 )
@@ -47,68 +44,6 @@ from mjfim.records.estimate_parts import ResidualForce
 from mjfim.records.events import begin_stage
 from mjfim.records.robots import RecordingComparison
 from mjfim.records.trajectory import Recording
-
-# Numbers with which a law is more than a position servo, unless they have no effect.
-BEYOND_SERVOS = {
-    "ki",
-    "slew",
-    "latency",
-    "time_constant",
-    "feedback_latency",
-    "velocity_time_constant",
-    "acceleration",
-}
-
-
-def laws_in_loop(
-    system: System, theta: Array, clipped: Mapping[str, float]
-) -> tuple[ControlLawInLoop, ...]:
-    """Describe the laws at some parameters.
-
-    Args:
-        system: The system.
-        theta: (p,) parameters [theta-unit].
-        clipped: Share of the samples at which the limits of a law clip its control, by actuator.
-
-    Returns:
-        The laws; none where logs hold the controls themselves.
-    """
-    if system.laws is None:
-        return ()
-    model = system.plant.model(theta)
-    paths = {target.path for p in system.parameters.parameters for target in p.targets}
-    found = []
-    for law in system.laws.laws:
-        values = law.numbers(model)
-        numbers: dict[str, float] = {}
-        units: dict[str, str] = {}
-        for field, names in FIELDS.items():
-            is_end = len(names) > 1
-            for i, name in enumerate(names):
-                key = f"{field}[{i}]" if is_end else field
-                if np.isfinite(values[name]) and (is_end or values[name] != 0.0):
-                    numbers[key] = values[name]
-                    units[key] = law_unit(model, law.actuator, field)
-
-        plain = BEYOND_SERVOS.isdisjoint(numbers) and not law.differences
-        unit = control_unit(model, int(model.actuator(law.actuator).id))
-        is_servo = plain and unit in FORCE_UNITS.values() and set(law.columns) == {"reference"}
-        estimated = (key for key in numbers if f"controller/{law.actuator}:{key}" in paths)
-        found.append(
-            ControlLawInLoop(
-                actuator=law.actuator,
-                joint=law.joint,
-                rate=1.0 / (law.tick * float(model.opt.timestep)),
-                columns=tuple(system.laws.columns[i] for i in law.columns.values()),
-                numbers=numbers,
-                units=units,
-                estimated=tuple(estimated),
-                clipped=clipped.get(law.actuator, 0.0),
-                is_servo=is_servo,
-            )
-        )
-    return tuple(found)
-
 
 # Distance from the guess [prior standard deviations] above which an estimate contradicts its prior.
 IMPLAUSIBLE_PRIOR_DISTANCE = 4.0
