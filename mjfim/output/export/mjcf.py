@@ -558,7 +558,7 @@ def _state_others(xml: ModelXml, parameters: ParameterSet, theta: Array) -> bool
         for target in parameter.targets:
             field, number = target.field, target.scale * float(value) + target.offset
             if isinstance(field, SpecField) and field.field in ("mass", "density"):
-                xml.named(field.kind, field.name).set(field.field, all_digits(number))
+                xml.named("geom", field.name).set(field.field, all_digits(number))
                 has_masses = True
             elif isinstance(field, OF_SENSORS) and number != 0.0:
                 unit = parameter.unit if target.scale == 1.0 else ""
