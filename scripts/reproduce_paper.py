@@ -25,7 +25,7 @@ from mjfim.files import write_json
 from mjfim.model.coordinates import split_unit
 from mjfim.model.units import per_second
 from mjfim.output import rerun as rerun_log
-from mjfim.output.archive import write_design
+from mjfim.output.archive import write_data
 from mjfim.output.page import DESIGNED, INITIAL
 from mjfim.output.panels import Axis, Panel, Picture, dots, grid, line
 from mjfim.output.plots.draw import save
@@ -268,7 +268,7 @@ def main() -> None:
 
     # Files.
     args.output.mkdir(parents=True, exist_ok=True)
-    write_design(args.output, design, task.system)
+    write_data(args.output, design, task.system)
     write_json(args.output / "montecarlo_25Hz.json", studies[25.0].summary())
     write_json(args.output / "montecarlo_100Hz.json", studies[100.0].summary())
     write_figures(args.output, task, design, studies[25.0])

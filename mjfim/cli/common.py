@@ -237,14 +237,22 @@ class Run:
 
             StatedExecutor.parse(self.executor)  # a fault is said before the work
 
-    def claim(self, names: Iterable[str], inputs: Sequence[Path]) -> None:
-        """Make sure before the work that results can be written, and keep other runs out.
+    def claim(
+        self, kind: type[ShownRecord], inputs: Sequence[Path], further: Iterable[str] = ()
+    ) -> None:
+        """Make sure before the work that a result can be written, and keep other runs out.
 
         Args:
-            names: Files that the verb may write, with pictures as PNG.
+            kind: The kind of the result.
             inputs: Files that the verb reads, which it must not replace.
+            further: Files beside those that every result of this kind may have.
         """
-        claim_folder(self.output, self.pictures.files(names), inputs, force=self.force)
+        if self.output:
+            from mjfim.output.folders import matching, names_of
+
+            present = matching(self.output, names_of(kind, self.pictures))
+            names = [*(file.name for file in present), *further]
+            claim_folder(self.output, names, inputs, force=self.force)
 
     @contextmanager
     def workers(self, tasks: int = MAX_PARTS, processes: int = 0) -> Iterator[Workers | None]:

@@ -40,14 +40,12 @@ def compare(
 
     from mjfim.experiment.packing import input_files
     from mjfim.experiment.system import System
-    from mjfim.output.folders import comparison_files
-    from mjfim.studies.compare import chosen_methods
 
     system = System.resolve(stated, threads=run.threads)
     chosen = None
     if methods is not None:
         chosen = [name.strip() for name in methods.split(",") if name.strip()]
-    run.claim(comparison_files(chosen_methods(system, chosen)), input_files(stated))
+    run.claim(mjfim.Comparison, input_files(stated))
 
     with run.workers() as workers, progress("comparing") as show:
         result = mjfim.compare(

@@ -56,7 +56,6 @@ def design(
     from mjfim.excitation.task_parts import require_design_keys
     from mjfim.experiment.packing import input_files
     from mjfim.experiment.system import System
-    from mjfim.output.folders import DESIGN_FILES, SHORTEST_FILES
 
     if starts is not None:
         stated = stated.replace(descent={"starts": starts})
@@ -68,8 +67,9 @@ def design(
     require_design_keys(system)
     task = DesignTask.of(system)
 
-    claim_video(video, input_files(stated), force=run.force)
-    run.claim((*DESIGN_FILES, *(SHORTEST_FILES if shortest else ())), input_files(stated))
+    inputs = input_files(stated)
+    claim_video(video, inputs, force=run.force)
+    run.claim(mjfim.Design, inputs, ("shortest.json", "shortest.npz") if shortest else ())
 
     found = None
     with ExitStack() as during:

@@ -88,7 +88,7 @@ def identify(
 
     from mjfim.experiment.packing import input_files, with_model
     from mjfim.experiment.system import System
-    from mjfim.output.folders import estimate_files, parts_of_identified, sample_files
+    from mjfim.output.folders import identified_models, sample_files
     from mjfim.output.pages.files import log_section
     from mjfim.recordings.read import read_log, recording_paths
     from mjfim.records.check import Check
@@ -103,15 +103,10 @@ def identify(
     inputs = input_files(stated, [*recordings, *(held_out or [])])
     fitted_paths = recording_paths(recordings, system.channels)
     held_out_paths = recording_paths(held_out or [], system.channels)
-    names = (
-        *estimate_files(
-            len(fitted_paths), len(held_out_paths), select=select, samples=bool(samples)
-        ),
-        *parts_of_identified(run.output, system.model_path),
-        *sample_files(run.output, samples or 0, system.model_path),
-    )
+    models = identified_models(run.output, system.model_path)
+    drawn = sample_files(run.output) if samples else ()
     claim_video(video, inputs, force=run.force)
-    run.claim(names, inputs)
+    run.claim(mjfim.Estimate, inputs, (*models, *drawn))
 
     with progress("reading"):
         logs = [read_log(path, system.channels) for path in (*fitted_paths, *held_out_paths)]

@@ -63,13 +63,12 @@ def watch(
         raise RecordingError(f"{stream}: no such file")
 
     from mjfim.experiment.packing import input_files
-    from mjfim.output.folders import WATCH_FILES
 
     meter = mjfim.Meter(stated, threads=run.threads)
     if run.output:
         draw_elsewhere()
-        files = [] if stream == STDIN else [Path(stream)]
-        run.claim(WATCH_FILES, input_files(stated, files))
+    files = [] if stream == STDIN else [Path(stream)]
+    run.claim(mjfim.Watch, input_files(stated, files))
     with (
         stop_on_interrupt() as stop,
         _table() as table,

@@ -45,17 +45,6 @@ class PictureFormat(StrEnum):
         """
         return f"{picture}.{self.value}"
 
-    def files(self, names: Iterable[str]) -> tuple[str, ...]:
-        """Return the names of files, where all pictures have this format.
-
-        Args:
-            names: Names of files; those of pictures end in .png.
-        """
-        return tuple(
-            name.removesuffix("png") + self.value if name.endswith(".png") else name
-            for name in names
-        )
-
 
 class Term(str):
     """The word for a thing that is shown, with its colours.
