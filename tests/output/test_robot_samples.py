@@ -14,7 +14,7 @@ from numpy.testing import assert_array_equal
 import mjfim
 from mjfim.experiment.system import System
 from mjfim.identification.assessment.parameter_draws import draw_parameters_system
-from mjfim.model.comparison import same_dynamics
+from mjfim.model.given import same_dynamics
 from mjfim.output import folders
 from mjfim.output.export.mjcf import write_identified
 from mjfim.output.folders import clear_samples, sample_files, write_samples

@@ -23,16 +23,16 @@ from mjfim.errors import ExperimentError, ModelError, OutputError, first_ones, l
 from mjfim.experiment.packing import input_files
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
-from mjfim.model.comparison import (
+from mjfim.model.control_laws import remove_numbers
+from mjfim.model.elements import element_count, element_name
+from mjfim.model.given import (
     ROUNDING,
     TOLERANCE,
     differ_in_inertia,
     differences,
+    exact_numbers,
     same_inertias,
 )
-from mjfim.model.control_laws import remove_numbers
-from mjfim.model.elements import element_count, element_name
-from mjfim.model.given import exact_numbers
 from mjfim.model.loading import ModelSource, compile_spec, refused
 from mjfim.model.model_files import changed_files, elements_of
 from mjfim.model.parameters import ParameterSet
