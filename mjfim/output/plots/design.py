@@ -169,15 +169,20 @@ def both_motions(design: Design) -> dict[str, Trajectory]:
 
 
 def motion_panels(
-    labels: Labels, trajectories: Mapping[str, Trajectory], usage: Sequence[LimitUsage] = ()
+    labels: Labels,
+    trajectories: Mapping[str, Trajectory],
+    usage: Sequence[LimitUsage] = (),
+    roles: Mapping[str, str] | None = None,
 ) -> dict[str, list[Panel]]:
     """Return panels of positions, velocities and controls of one or more trajectories.
 
     Args:
         labels: Names and units of all columns.
-        trajectories: The trajectories by their role.
+        trajectories: The trajectories by their name.
         usage: Limits, which are lines where the motion comes near them.
+        roles: Roles of the trajectories by their name; default: the name.
     """
+    roles = roles or {name: name for name in trajectories}
     shown = list(trajectories.values())
     positions, qpos = shown_positions(labels, *(each.qpos for each in shown))
     velocities = [label.replace(" velocity [", " [") for label in labels.velocities]
@@ -194,8 +199,8 @@ def motion_panels(
         for k, name in enumerate(names):
             columns = [each[:, k] for each in values]
             curves = [
-                _curve(trajectory.t, y, role, width)
-                for (role, trajectory), y, width in zip(
+                _curve(trajectory.t, y, roles[key], width, key)
+                for (key, trajectory), y, width in zip(
                     trajectories.items(), columns, (*LINE_WIDTHS, *[1.3] * len(shown)), strict=False
                 )
             ]
@@ -212,10 +217,10 @@ def motion_panels(
     return panels
 
 
-def _curve(t: Array, y: Array, role: str, width: float) -> Mark:
+def _curve(t: Array, y: Array, role: str, width: float, label: str) -> Mark:
     """Return a curve over time; a control is held from each time to the next."""
     kind: Kind = "line" if len(y) == len(t) else "steps"
-    return mark(kind, t, y, role, width=width, label=role)
+    return mark(kind, t, y, role, width=width, label=label)
 
 
 def _near_limits(limits: Sequence[float], values: Sequence[Array]) -> list[Mark]:
