@@ -369,27 +369,27 @@ def print_result(
 
 
 def claim_folder(
-    folder: Path, names: Iterable[str], inputs: Sequence[Path], *, force: bool
+    folder: Path,
+    names: Iterable[str],
+    inputs: Sequence[Path],
+    *,
+    force: bool,
+    exclusive: bool = True,
 ) -> None:
-    """Make sure before the work that results can be written, and keep other runs out."""
-    from mjfim.output.folders import check_folder
-    from mjfim.output.manifest import OutputGuard, claimed
+    """Make sure before the work that results can be written; exclusive: keep other runs out."""
+    from mjfim.output.manifest import OutputGuard, claimed, require_writable
 
-    check_folder(folder)
+    require_writable(folder)
     guard = OutputGuard(inputs, force=force)
     guard.check(folder / name for name in names)
-    _claims.enter_context(claimed(folder, guard, exclusive=True))
+    _claims.enter_context(claimed(folder, guard, exclusive=exclusive))
 
 
 def claim_file(file: Path, inputs: Sequence[Path], *, force: bool) -> None:
     """Make sure before the work that a single file can be written."""
-    from mjfim.output.folders import check_file
-    from mjfim.output.manifest import OutputGuard, claimed
-
-    check_file(file)
-    guard = OutputGuard(inputs, force=force)
-    guard.check([file])
-    _claims.enter_context(claimed(file.parent, guard, exclusive=False))
+    if file.is_dir():
+        raise RecordingError(f"{file}: is a folder; -o and --save need a file here")
+    claim_folder(file.parent, [file.name], inputs, force=force, exclusive=False)
 
 
 def claim_video(video: Path | None, inputs: Sequence[Path], *, force: bool) -> None:

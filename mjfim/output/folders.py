@@ -228,36 +228,6 @@ def find_experiment_file(source: Path) -> Path:
     return found.relative_to(Path.cwd()) if found.is_relative_to(Path.cwd()) else found
 
 
-def check_folder(folder: Path) -> None:
-    """Check before the work, not after it, that results can be written to a folder.
-
-    Args:
-        folder: The folder; it need not exist yet.
-
-    Raises:
-        RecordingError: It is a file, or writing is not permitted.
-    """
-    existing = next(p for p in (folder, *folder.absolute().parents) if p.exists())
-    if not existing.is_dir():
-        raise RecordingError(f"{existing}: is a file; -o needs a folder")
-    if not os.access(existing, os.W_OK):
-        raise RecordingError(f"{existing}: no permission to write here")
-
-
-def check_file(path: Path) -> None:
-    """Check before the work that a file can be written.
-
-    Args:
-        path: The file; it need not exist yet.
-
-    Raises:
-        RecordingError: It is a folder, or writing is not permitted.
-    """
-    if path.is_dir():
-        raise RecordingError(f"{path}: is a folder; -o and --save need a file here")
-    check_folder(path.parent)
-
-
 def write_result(
     folder: Path,
     record: ShownRecord,

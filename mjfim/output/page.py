@@ -18,11 +18,11 @@ them.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 from itertools import zip_longest
-from typing import NamedTuple, Self
+from typing import Any, NamedTuple, Self
 
 from mjfim.records.verdict import Verdict
 
@@ -274,6 +274,20 @@ def numbers(
 def named(name: str, unit: str) -> str:
     """Write a name with its unit."""
     return f"{name} ({unit})" if unit else name
+
+
+def parameter_names(
+    of: Any, chosen: Iterable[int] | None = None, write: Callable[[str, str], str] = named
+) -> list[str]:
+    """Write the names of the parameters of a result with their units.
+
+    Args:
+        of: The result, with `parameters` and `units`.
+        chosen: Numbers of the parameters; default: all.
+        write: Writes a name with its unit.
+    """
+    every = list(map(write, of.parameters, of.units))
+    return every if chosen is None else [every[j] for j in chosen]
 
 
 def tabulated(

@@ -165,7 +165,6 @@ class Panel:
         cells: Coloured cells.
         place: Row and column in the picture.
         is_wide: Whether it takes all columns.
-        is_tall: Whether it takes all rows.
         is_shaded: Whether its background is grey.
     """
 
@@ -180,7 +179,6 @@ class Panel:
     cells: Cells | None = None
     place: tuple[int, int] = (0, 0)
     is_wide: bool = False
-    is_tall: bool = False
     is_shaded: bool = False
 
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from mjfim.arrays import Array, record, scaled_pseudo_inverse
+from mjfim.arrays import Array, finite_or_nan, record, scaled_pseudo_inverse
 from mjfim.errors import MjfimError
 from mjfim.records.base import NamedEnum, Record, SavedRecord, ShownRecord, no_array
 from mjfim.records.rehearsal import Rehearsal, Valley
@@ -603,7 +603,7 @@ class Design(ParameterResult):
         """(p, p) predicted covariance; NaN where a parameter is not identifiable alone."""
         inverse = scaled_pseudo_inverse(self.final.information, SMALLEST_EIGENVALUE)
         spread = np.sqrt(np.maximum(np.diag(inverse), np.finfo(float).tiny))
-        std = np.where(np.isfinite(self.stated_std), self.stated_std, np.nan) / spread
+        std = finite_or_nan(self.stated_std) / spread
         return np.asarray(inverse * np.outer(std, std))
 
     @property

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from mjfim.arrays import NORMAL_95, POORLY_KNOWN_SHARE, UNDETERMINED_SHARE, Array
+from mjfim.arrays import NORMAL_95, POORLY_KNOWN_SHARE, UNDETERMINED_SHARE, Array, finite_or_nan
 from mjfim.errors import first_ones, listed
 from mjfim.output.page import (
     Emphasis,
@@ -24,6 +24,7 @@ from mjfim.output.page import (
     named,
     number,
     numbers,
+    parameter_names,
     tabulated,
     warned,
 )
@@ -193,7 +194,7 @@ def _faults(rehearsal: Rehearsal) -> Iterator[str]:
     if rehearsal.passes_floor.any():
         passing, deepest = _that(rehearsal.below_floor, "pass"), -np.nanmin(rehearsal.lowest)
         yield f"{passing} through {_floor(rehearsal)}, by up to {deepest:.3g} m"
-    worst = np.where(np.isfinite(rehearsal.margins), rehearsal.margins, np.nan)
+    worst = finite_or_nan(rehearsal.margins)
     broken = np.flatnonzero(~rehearsal.kept.all(axis=0))
     order = np.lexsort((rehearsal.kept[:, broken].sum(axis=0), rehearsal.is_clamped[broken]))
     for i in broken[order].tolist():
@@ -502,7 +503,7 @@ def _valley_parts(valley: Valley) -> Sequence[Part]:
     table = tabulated(
         "Two robots that move alike",
         {
-            "parameter": [named(valley.parameters[j], valley.units[j]) for j in moved],
+            "parameter": parameter_names(valley, moved),
             "robot 1": numbers(valley.theta[0, moved], 4),
             "robot 2": numbers(valley.theta[1, moved], 4),
             "difference": numbers(np.diff(valley.percent, axis=0)[0, moved], 3, " %"),
@@ -527,7 +528,7 @@ def _surroundings(rehearsal: Rehearsal) -> str:
 
 def _margin_table(rehearsal: Rehearsal) -> Table:
     """Tabulate the limits, the least kept first."""
-    worst = np.where(np.isfinite(rehearsal.margins), rehearsal.margins, np.nan)
+    worst = finite_or_nan(rehearsal.margins)
     least = np.nanmin(worst, axis=0)
     order = np.argsort(least, kind="stable").tolist()
     limits = [rehearsal.limits[i] for i in order]

@@ -26,6 +26,7 @@ from mjfim.output.page import (
     named,
     number,
     numbers,
+    parameter_names,
     shown_word,
     tabulated,
     warned,
@@ -102,7 +103,7 @@ def _campaign_table(campaign: Campaign, true: Array | None) -> Table:
     estimate, chosen = campaign.rounds[-1].estimate, campaign.interest
     values, std, wanted = estimate.theta[chosen], estimate.std[chosen], campaign.wanted[chosen]
     columns = {
-        "parameter": [named(estimate.parameters[j], estimate.units[j]) for j in chosen],
+        "parameter": parameter_names(estimate, chosen),
         NOMINAL: numbers(campaign.rounds[0].theta[chosen], 5),
         IDENTIFIED: numbers(values, 5),
         "formal σ": numbers(std, 2),
@@ -181,7 +182,7 @@ def _robot_table(comparison: RobotComparison) -> Table:
     return tabulated(
         "Parameters of both robots",
         {
-            "parameter": [named(comparison.parameters[j], comparison.units[j]) for j in order],
+            "parameter": parameter_names(comparison, order),
             **robots,
             "difference": numbers(comparison.difference[order]),
             "95 % low": numbers(low),
@@ -306,7 +307,7 @@ def _method_row(comparison: Comparison, row: MethodResult) -> Row:
 
 def _std_table(comparison: Comparison) -> Table:
     wanted = list(comparison.wanted)
-    names = [named(comparison.parameters[j], comparison.units[j]) for j in wanted]
+    names = parameter_names(comparison, wanted)
     std = {row.title: numbers(row.std[wanted]) for row in comparison.rows}
     return tabulated("σ of each parameter", {"parameter": names, **std}, detail=True)
 
@@ -316,10 +317,7 @@ def _std_table(comparison: Comparison) -> Table:
 
 def study_page(study: MonteCarloStudy) -> Page:
     """Describe the observed scatter of estimates beside the Cramér-Rao bound."""
-    names = [
-        named(name, unit)
-        for name, unit in zip(study.parameters, study.labels.parameter_units, strict=True)
-    ]
+    names = list(map(named, study.parameters, study.labels.parameter_units))
     ranges = [
         f"{min(trials.efficiency):.2f} to {max(trials.efficiency):.2f} in {trials.trials:,} trials "
         f"along the {shown_word(name)} trajectory"
@@ -459,7 +457,7 @@ def equation_page(fit: InverseDynamicsFit) -> Page:
     table = tabulated(
         "Parameters",
         {
-            "parameter": list(map(named, fit.parameters, fit.units)),
+            "parameter": parameter_names(fit),
             "start": numbers(fit.start, 4),
             "estimate": numbers(fit.theta, 5),
             "formal σ": std,
@@ -558,7 +556,7 @@ def watch_page(watch: Watch) -> Page:
     order = np.argsort(np.isfinite(watch.reached), kind="stable")
     std, wanted, reached = watch.std[order], watch.wanted[order], watch.reached[order]
     columns = {
-        "parameter": [named(watch.parameters[j], watch.units[j]) for j in order.tolist()],
+        "parameter": parameter_names(watch, order),
         "σ now": numbers(std, infinite=NOT_ALONE),
         "of the value": list(map(relative, std.tolist(), watch.sizes[order].tolist())),
         "wanted": numbers(wanted, infinite=""),

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from mjfim.arrays import Array
+from mjfim.arrays import Array, finite_or_nan
 from mjfim.model.coordinates import split_unit
 from mjfim.model.units import FORCE_UNITS, LENGTH, per_second
 from mjfim.output.archive import shown_positions
@@ -314,7 +314,7 @@ def accuracy(design: Design, labels: Labels) -> Picture:
 
     title, shares = "Predicted accuracy of one experiment", after / sizes
     if np.isfinite(shares).any():
-        worst = int(np.nanargmax(np.where(np.isfinite(shares), shares, np.nan)))
+        worst = int(np.nanargmax(finite_or_nan(shares)))
         title += f": σ is at most {relative(after[worst], sizes[worst])} ({names[worst]})"
     note = sigma_remark(design.inflation, design.parameters)
     if not np.array_equal(np.abs(design.theta), design.sizes):
@@ -561,7 +561,7 @@ def _sensors(result: Worth, rows: list[SensorWorth]) -> Panel:
     def ratios(stds: list[Array]) -> Array:
         """Largest ratio for each row; NaN where it is infinite."""
         found = np.array([result.ratio(std) for std in stds])
-        return np.where(np.isfinite(found), found, np.nan)
+        return finite_or_nan(found)
 
     is_added = np.array([each.is_added for each in rows])
     without = ratios([each.without for each in rows])
