@@ -61,7 +61,7 @@ def campaign(
     stated = mjfim.Experiment.from_file(experiment)
 
     from mjfim.excitation.task import DesignTask
-    from mjfim.experiment.packing import input_files, with_model
+    from mjfim.experiment.packing import with_model
     from mjfim.output.campaign_folder import CampaignFolder, campaign_settings
     from mjfim.output.pages.studies import campaign_page
     from mjfim.records.campaign import CampaignStatus
@@ -73,8 +73,8 @@ def campaign(
     settings = campaign_settings(task.experiment, seed) if simulated else {}
     if simulated:
         _require_simulation(folder, task.experiment, settings, resume=resume)
-    inputs = input_files(task.experiment, recordings or [])
-    run.claim(mjfim.Campaign, inputs, folder.next_files(simulated=simulated))
+    names = folder.next_files(simulated=simulated)
+    run.claim(mjfim.Campaign, task.experiment, recordings or (), names)
 
     with run.workers() as workers, progress("designing") as display:
         lab = _Lab(task=task, folder=folder, display=display, rounds=rounds)

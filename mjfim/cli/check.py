@@ -30,7 +30,6 @@ def check(
         draw_elsewhere()
 
     from mjfim.experiment.given import check_fits, recordings_of
-    from mjfim.experiment.packing import input_files
     from mjfim.experiment.system import System
     from mjfim.output import archive
 
@@ -41,7 +40,7 @@ def check(
     if design_file is not None:
         trajectory = archive.read_design(design_file)["final"]
         check_fits(design_file, trajectory, system)
-    run.claim(mjfim.Check, input_files(stated, [*(recordings or []), design_file]))
+    run.claim(mjfim.Check, stated, [*(recordings or []), design_file])
 
     with run.workers() as workers, progress("checking"):
         result = mjfim.check(stated, loaded, trajectory, threads=run.threads, executor=workers)

@@ -238,18 +238,28 @@ class Run:
             StatedExecutor.parse(self.executor)  # a fault is said before the work
 
     def claim(
-        self, kind: type[ShownRecord], inputs: Sequence[Path], further: Iterable[str] = ()
+        self,
+        kind: type[ShownRecord],
+        experiment: mjfim.Experiment | None,
+        read: Iterable[Path | None] = (),
+        further: Iterable[str] = (),
+        video: Path | None = None,
     ) -> None:
         """Make sure before the work that a result can be written, and keep other runs out.
 
         Args:
             kind: The kind of the result.
-            inputs: Files that the verb reads, which it must not replace.
+            experiment: The experiment, whose files must not be replaced.
+            read: Other files and folders that the verb reads, likewise.
             further: Files beside those that every result of this kind may have.
+            video: A video that the user wants.
         """
         if self.output:
+            from mjfim.experiment.packing import input_files
             from mjfim.output.folders import matching, names_of
 
+            inputs = input_files(experiment, read)
+            claim_video(video, inputs, force=self.force)
             present = matching(self.output, names_of(kind, self.pictures))
             names = [*(file.name for file in present), *further]
             claim_folder(self.output, names, inputs, force=self.force)

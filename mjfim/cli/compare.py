@@ -38,14 +38,13 @@ def compare(
     """
     stated = mjfim.Experiment.from_file(experiment)
 
-    from mjfim.experiment.packing import input_files
     from mjfim.experiment.system import System
 
     system = System.resolve(stated, threads=run.threads)
     chosen = None
     if methods is not None:
         chosen = [name.strip() for name in methods.split(",") if name.strip()]
-    run.claim(mjfim.Comparison, input_files(stated))
+    run.claim(mjfim.Comparison, stated)
 
     with run.workers() as workers, progress("comparing") as show:
         result = mjfim.compare(

@@ -41,7 +41,7 @@ def compare_robots(
 
     estimates = [mjfim.Estimate.load(folder) for folder in (first, second)]
     inputs = [folder / name for folder in (first, second) for name in ESTIMATE_FILES]
-    run.claim(mjfim.RobotComparison, inputs)
+    run.claim(mjfim.RobotComparison, None, inputs)
     result = mjfim.compare_estimates(*estimates, names=_names(first, second))
     result = replace(result, remarks=(*result.remarks, *_differences_of_files(first, second)))
 

@@ -13,7 +13,6 @@ from mjfim.cli.common import (
     LiveView,
     Run,
     VideoFile,
-    claim_video,
     draw_elsewhere,
     verb,
     write_wanted_video,
@@ -54,7 +53,6 @@ def design(
     from mjfim.excitation.shortest_horizon import OutOfReachError
     from mjfim.excitation.task import DesignTask
     from mjfim.excitation.task_parts import require_design_keys
-    from mjfim.experiment.packing import input_files
     from mjfim.experiment.system import System
 
     if starts is not None:
@@ -67,9 +65,8 @@ def design(
     require_design_keys(system)
     task = DesignTask.of(system)
 
-    inputs = input_files(stated)
-    claim_video(video, inputs, force=run.force)
-    run.claim(mjfim.Design, inputs, ("shortest.json", "shortest.npz") if shortest else ())
+    names = ("shortest.json", "shortest.npz") if shortest else ()
+    run.claim(mjfim.Design, stated, further=names, video=video)
 
     found = None
     with ExitStack() as during:

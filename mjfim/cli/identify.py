@@ -15,7 +15,6 @@ from mjfim.cli.common import (
     LiveView,
     Run,
     VideoFile,
-    claim_video,
     verb,
     write_wanted_video,
 )
@@ -86,7 +85,7 @@ def identify(
     if select and method == "newton":
         raise ExperimentError("--select: fits with the method least_squares only, not newton")
 
-    from mjfim.experiment.packing import input_files, with_model
+    from mjfim.experiment.packing import with_model
     from mjfim.experiment.system import System
     from mjfim.output.folders import identified_models, sample_files
     from mjfim.output.pages.files import log_section
@@ -100,13 +99,12 @@ def identify(
         kind = Check if (predicted / "check.npz").is_file() else Design
         prediction = kind.load(predicted)
     system = System.resolve(stated, threads=run.threads)
-    inputs = input_files(stated, [*recordings, *(held_out or [])])
     fitted_paths = recording_paths(recordings, system.channels)
     held_out_paths = recording_paths(held_out or [], system.channels)
     models = identified_models(run.output, system.model_path)
     drawn = sample_files(run.output) if samples else ()
-    claim_video(video, inputs, force=run.force)
-    run.claim(mjfim.Estimate, inputs, (*models, *drawn))
+    logs_read = [*recordings, *(held_out or [])]
+    run.claim(mjfim.Estimate, stated, logs_read, (*models, *drawn), video)
 
     with progress("reading"):
         logs = [read_log(path, system.channels) for path in (*fitted_paths, *held_out_paths)]

@@ -31,7 +31,6 @@ def montecarlo(
         stated = stated.replace(measure_rate=measure_rate)
 
     from mjfim.experiment.given import check_fits
-    from mjfim.experiment.packing import input_files
     from mjfim.experiment.system import System
     from mjfim.output import archive
 
@@ -39,7 +38,7 @@ def montecarlo(
     named = archive.read_design(design_file)
     for trajectory in named.values():
         check_fits(design_file, trajectory, system)
-    run.claim(mjfim.MonteCarloStudy, input_files(stated, [design_file]))
+    run.claim(mjfim.MonteCarloStudy, stated, [design_file])
 
     with (
         run.workers(trials) as workers,

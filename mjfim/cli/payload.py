@@ -66,7 +66,7 @@ def payload(
     """
     stated = mjfim.Experiment.from_file(experiment)
 
-    from mjfim.experiment.packing import input_files, with_model
+    from mjfim.experiment.packing import with_model
     from mjfim.output.folders import identified_models
     from mjfim.recordings.read import read_log, recording_paths
     from mjfim.studies.payload import PayloadTask
@@ -83,8 +83,8 @@ def payload(
     system = task.system()
     paths = recording_paths(recordings, system.channels)
     unloaded = recording_paths(without or [], system.channels)
-    inputs = input_files(stated, [*recordings, *(without or []), robot])
-    run.claim(mjfim.Estimate, inputs, identified_models(run.output, system.model_path))
+    models = identified_models(run.output, system.model_path)
+    run.claim(mjfim.Estimate, stated, [*recordings, *(without or []), robot], models)
 
     with progress("reading"):
         logs = [read_log(path, system.channels).recording for path in (*paths, *unloaded)]

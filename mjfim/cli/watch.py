@@ -62,13 +62,11 @@ def watch(
     if stream != STDIN and not (Path(stream).exists() and not Path(stream).is_dir()):
         raise RecordingError(f"{stream}: no such file")
 
-    from mjfim.experiment.packing import input_files
-
     meter = mjfim.Meter(stated, threads=run.threads)
     if run.output:
         draw_elsewhere()
     files = [] if stream == STDIN else [Path(stream)]
-    run.claim(mjfim.Watch, input_files(stated, files))
+    run.claim(mjfim.Watch, stated, files)
     with (
         stop_on_interrupt() as stop,
         _table() as table,

@@ -40,7 +40,6 @@ def worth(
     ] = 60.0,
 ) -> None:
     """Say which sensor, which data and which limit would make the parameters more accurate."""
-    from mjfim.experiment.packing import input_files
     from mjfim.experiment.system import System
     from mjfim.output.folders import find_experiment_file
 
@@ -53,7 +52,7 @@ def worth(
     added = dict(map(_sensor, add or []))
     if run.output:
         draw_elsewhere()
-    run.claim(mjfim.Worth, input_files(stated, [file]))
+    run.claim(mjfim.Worth, stated, [file])
     with progress("comparing"):
         result = mjfim.worth(stated, design, add=added, seconds=seconds, threads=run.threads)
     run.finish(result, System.resolve(stated), design=file.parent if is_design else None)

@@ -394,7 +394,7 @@ class Check(ParameterResult):
         """(t, t) predicted covariance of `wanted`; NaN where one is not identifiable alone."""
         std = np.array([row.std for row in self.rows if not row.nuisance])
         std = finite_or_nan(std)
-        return np.asarray(self.correlation * np.outer(std, std))
+        return self.correlation * np.outer(std, std)
 
     @property
     def is_dangerous(self) -> bool:

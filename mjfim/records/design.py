@@ -596,7 +596,7 @@ class Design(ParameterResult):
         """(N+1, p) standard deviations to state, by the measurements up to each sample."""
         std = self.final.std
         ratio = np.divide(self.stated_std, std, out=np.ones(len(std)), where=np.isfinite(std))
-        return np.asarray(self.final.std_over_time * ratio)
+        return self.final.std_over_time * ratio
 
     @property
     def covariance(self) -> Array:
@@ -604,7 +604,7 @@ class Design(ParameterResult):
         inverse = scaled_pseudo_inverse(self.final.information, SMALLEST_EIGENVALUE)
         spread = np.sqrt(np.maximum(np.diag(inverse), np.finfo(float).tiny))
         std = finite_or_nan(self.stated_std) / spread
-        return np.asarray(inverse * np.outer(std, std))
+        return inverse * np.outer(std, std)
 
     @property
     def shares(self) -> Array:
