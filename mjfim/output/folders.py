@@ -145,7 +145,6 @@ SETTINGS_FILE = "settings.json"
 # Files beside the data, the report and the pictures of a result.
 FURTHER: dict[type[ShownRecord], str] = {
     Campaign: SETTINGS_FILE,
-    Comparison: STALE[Comparison],
     Design: "|".join(DESIGN_ARCHIVE),
 }
 
@@ -153,7 +152,7 @@ FURTHER: dict[type[ShownRecord], str] = {
 def names_of(kind: type[ShownRecord], picture_format: PictureFormat) -> str:
     """Return the pattern of the names of all files that a result of a kind may have.
 
-    Models are not among them, whose names depend on the user's model; see `identified_models`.
+    Those that hold names of the user are not among them; see `identified_models`.
     """
     pictures = PICTURES.get(kind, kind.file_stem)
     data = rf"{kind.file_stem}\.(json|npz|rrd)|{REPORT}|{FURTHER.get(kind, '')}"

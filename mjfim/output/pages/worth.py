@@ -23,7 +23,7 @@ from mjfim.output.page import (
 )
 from mjfim.output.words import NOT_ALONE, improvement
 from mjfim.records.verdict import Level, Verdict
-from mjfim.records.worth import Price, SensorWorth, Worth
+from mjfim.records.worth import Price, Worth
 
 # Increase of σ up to which a sensor is hardly needed, and from which its row is marked (factors).
 SMALL_INCREASE, LARGE_INCREASE = 1.05, 2.0
@@ -57,19 +57,14 @@ def headline(worth: Worth) -> str:
     for added in (False, True):
         rows = [each for each in worth.single if each.is_added == added]
         if rows:
-            best = min(rows, key=lambda each: worth.ratio(_improved(each)))
+            best = min(rows, key=lambda each: worth.ratio(each.improved))
             what = best.name if added else f"half the noise of {best.name}"
-            helps.append(f"{what} ({change(worth, _improved(best)).partition(' (')[0]})")
+            helps.append(f"{what} ({change(worth, best.improved).partition(' (')[0]})")
     if worth.prices:
         price = worth.dearest[0]
         helps.append(f"{price_name(price)} ({percent(price.change)})")
     helps = [each for each in helps if "(same)" not in each] or ["none of these sensors"]
     return f"{capitalised(worth.source)} {reached}. What lowers σ: {', '.join(helps)}."
-
-
-def _improved(sensor: SensorWorth) -> Array:
-    """(p,) standard deviations with half of the noise, or with a sensor that is added."""
-    return sensor.present if sensor.is_added else sensor.halved
 
 
 def worth_parts(worth: Worth, *, detail: bool = False) -> list[Part]:

@@ -550,7 +550,7 @@ def worth(result: Worth) -> Picture:
 
 def _reach(result: Worth, sensor: SensorWorth) -> float:
     """Ratio of the largest and the smallest σ that a sensor makes a difference for."""
-    least = result.ratio(sensor.present if sensor.is_added else sensor.halved)
+    least = result.ratio(sensor.improved)
     return 1.0 if np.isinf(least) else result.ratio(sensor.without) / least
 
 
@@ -565,7 +565,7 @@ def _sensors(result: Worth, rows: list[SensorWorth]) -> Panel:
 
     is_added = np.array([each.is_added for each in rows])
     without = ratios([each.without for each in rows])
-    better = ratios([each.present if each.is_added else each.halved for each in rows])
+    better = ratios([each.improved for each in rows])
     alone = ratios([each.alone for each in rows])
     places = np.arange(len(rows))
     low, high = around(np.concatenate([without, better, [1.0, now]]), factor=2.0)
