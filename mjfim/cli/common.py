@@ -35,7 +35,7 @@ from mjfim.errors import (
 from mjfim.files import observed_by, remove_temporary_files
 from mjfim.output.live import ADDRESS, HERE
 from mjfim.output.manifest import write_optional
-from mjfim.output.page import REPORT, Page, PictureFormat, Section
+from mjfim.output.page import REPORT, Page, Part, PictureFormat
 from mjfim.output.video import require_format, write_video
 from mjfim.parallel.budget import (
     INTERRUPTED_CODE,
@@ -310,7 +310,7 @@ class Run:
         *,
         design: Path | None = None,
         further: Mapping[str, object] = NOTHING,
-        sections: Iterable[Section] = (),
+        sections: Mapping[str, Sequence[Part]] = MappingProxyType({}),
         remarks: Iterable[str] = (),
     ) -> int:
         """Write the files of a result where there is a folder, print it, and draw its pictures.
@@ -341,7 +341,7 @@ class Run:
             # It is printed after it is written, also where it cannot be written.
             source = None if system is None else system.experiment.source
             page = page_of(result, experiment=source, design=design, output=self.output)
-            page = replace(page, sections=[*page.sections, *sections])
+            page = replace(page, sections={**page.sections, **sections})
             values = {**summary_with_origin(result, system, self.output), **further}
             print_result(self.as_json, values, page, verbose=self.verbose)
             if not page.verdict.ok and (self.as_json or not out.is_terminal):

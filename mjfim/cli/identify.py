@@ -88,7 +88,7 @@ def identify(
     from mjfim.experiment.packing import with_model
     from mjfim.experiment.system import System
     from mjfim.output.folders import identified_models, sample_files
-    from mjfim.output.pages.files import log_section
+    from mjfim.output.pages.files import log_tables
     from mjfim.recordings.read import read_log, recording_paths
     from mjfim.records.check import Check
     from mjfim.records.design import Design
@@ -127,7 +127,7 @@ def identify(
     if samples:
         result, not_drawn = _with_draws(result, system, samples, seed)
 
-    sections = [log_section([log.summary for log in logs])] if run.verbose else []
+    sections = {"Logs": log_tables([log.summary for log in logs])} if run.verbose else {}
     remarks = [f"warning: --samples: no robots were drawn{not_drawn}"] if not_drawn else []
     code = run.finish(result, system, sections=sections, remarks=remarks)
     write_wanted_video(video, system, result)

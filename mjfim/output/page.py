@@ -183,14 +183,6 @@ class Plot:
 Part = Table | Text | Listing | Plot
 
 
-@dataclass(frozen=True)
-class Section:
-    """Parts under a heading."""
-
-    title: str
-    parts: Sequence[Part]
-
-
 @dataclass(frozen=True, kw_only=True)
 class Page:
     """A result in words, tables and names of pictures.
@@ -203,7 +195,7 @@ class Page:
         warnings: What limits the result.
         details: Remarks that a short form leaves out.
         facts: Short facts by their names.
-        sections: Sections, the main results first.
+        sections: Parts by their headings, the main results first; those without parts go.
     """
 
     kind: str
@@ -213,9 +205,12 @@ class Page:
     warnings: tuple[str, ...] = ()
     details: tuple[str, ...] = ()
     facts: Mapping[str, str] = field(default_factory=dict)
-    sections: Sequence[Section] = ()
+    sections: Mapping[str, Iterable[Part]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
+        sections = {title: tuple(parts) for title, parts in self.sections.items()}
+        kept = {title: parts for title, parts in sections.items() if parts}
+        object.__setattr__(self, "sections", kept)
         verdict = self.verdict._replace(
             sentence=capitalised(self.verdict.sentence),
             reasons=(*self.causes, *self.warnings),
@@ -231,8 +226,8 @@ class Page:
     @property
     def every_part(self) -> Iterator[Part]:
         """All parts, in their order."""
-        for section in self.sections:
-            yield from section.parts
+        for parts in self.sections.values():
+            yield from parts
 
     @property
     def parts(self) -> Iterator[Table | Text | Listing]:

@@ -21,7 +21,6 @@ from mjfim.output.page import (
     Part,
     Plot,
     Row,
-    Section,
     Table,
     Text,
     capitalised,
@@ -94,7 +93,7 @@ def estimate_page(estimate: Estimate) -> Page:
             "iterations": str(estimate.iterations),
             "time of the fit": f"{estimate.seconds:.3g} s",
         },
-        sections=[Section(title, found) for title, found in parts.items() if found],
+        sections=parts,
     )
 
 

@@ -18,7 +18,6 @@ from mjfim.output.page import (
     Part,
     Plot,
     Row,
-    Section,
     Table,
     Text,
     as_sentence,
@@ -75,12 +74,13 @@ def campaign_page(campaign: Campaign, true: Array | None = None) -> Page:
         campaign: The campaign.
         true: (p,) true values of its parameters [theta-unit], where they are known.
     """
-    facts, sections = {"rounds": str(len(campaign.rounds))}, []
+    facts: dict[str, str] = {"rounds": str(len(campaign.rounds))}
+    sections: dict[str, Sequence[Part]] = {}
     if campaign.rounds:
-        sections = [
-            Section("Parameters", [_campaign_table(campaign, true)]),
-            Section("Rounds", [Plot("campaign")]),
-        ]
+        sections = {
+            "Parameters": [_campaign_table(campaign, true)],
+            "Rounds": [Plot("campaign")],
+        }
         last = campaign.rounds[-1].estimate
         facts["recordings"] = str(len(last.recordings))
         facts["χ²/dof of the last fit"] = f"{last.chi2 / max(last.dof, 1):.3f}"
@@ -145,7 +145,7 @@ def robots_page(comparison: RobotComparison) -> Page:
             "compared parameters": str(len(comparison.parameters)),
             "all parameters together": p_text(comparison.joint_p),
         },
-        sections=[Section("Differences", parts)],
+        sections={"Differences": parts},
     )
 
 
@@ -246,7 +246,7 @@ def comparison_page(comparison: Comparison) -> Page:
             "budget of each": budget_in_words(comparison),
             "seed": str(comparison.seed),
         },
-        sections=[Section("Methods", parts)],
+        sections={"Methods": parts},
     )
 
 
@@ -339,19 +339,16 @@ def study_page(study: MonteCarloStudy) -> Page:
             **{f"trials, {shown_word(name)}": str(t.trials) for name, t in study.sets.items()},
             "rate of the measurements": f"{study.measure_rate:g} Hz",
         },
-        sections=[
-            Section(
-                "Efficiency",
-                [
-                    Text(f"Efficiency of the estimates: {', and '.join(ranges)} (1 is the best)"),
-                    *(_efficiency_table(study, name, names) for name in study.sets),
-                    Plot("overview"),
-                    Text(legend, Emphasis.WEAK),
-                ],
-            ),
-            Section("Estimates", [Plot("histogram")]),
-            Section("Covariance", _covariance_tables(study, names)),
-        ],
+        sections={
+            "Efficiency": [
+                Text(f"Efficiency of the estimates: {', and '.join(ranges)} (1 is the best)"),
+                *(_efficiency_table(study, name, names) for name in study.sets),
+                Plot("overview"),
+                Text(legend, Emphasis.WEAK),
+            ],
+            "Estimates": [Plot("histogram")],
+            "Covariance": _covariance_tables(study, names),
+        },
     )
 
 
@@ -467,10 +464,10 @@ def equation_page(fit: InverseDynamicsFit) -> Page:
         kind="Parameters fitted to the equation of motion",
         verdict=verdict,
         next_steps=steps,
-        sections=[
-            Section("Parameters", [Text(capitalised(fit.status)), table]),
-            Section("Equation of motion", list(equation_parts(fit))),
-        ],
+        sections={
+            "Parameters": [Text(capitalised(fit.status)), table],
+            "Equation of motion": equation_parts(fit),
+        },
     )
 
 
@@ -577,7 +574,7 @@ def watch_page(watch: Watch) -> Page:
         ),
         warnings=watch.warnings,
         facts={"rows": str(watch.rows), "duration": f"{watch.seconds:.1f} s"},
-        sections=[Section("Accuracy so far", [table, Plot("watch")])],
+        sections={"Accuracy so far": [table, Plot("watch")]},
     )
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
@@ -12,7 +12,6 @@ from mjfim.output.page import (
     Page,
     Part,
     Plot,
-    Section,
     Table,
     Text,
     capitalised,
@@ -42,7 +41,7 @@ def worth_page(worth: Worth) -> Page:
         verdict=Verdict(headline(worth), Level.GOOD, ok=True),
         next_steps=tuple(steps),
         facts={"motion": worth.source, "duration": f"{worth.horizon:g} s"},
-        sections=[Section("What would help", worth_parts(worth))],
+        sections={"What would help": worth_parts(worth)},
     )
 
 
@@ -67,13 +66,15 @@ def headline(worth: Worth) -> str:
     return f"{capitalised(worth.source)} {reached}. What lowers σ: {', '.join(helps)}."
 
 
-def worth_parts(worth: Worth, *, detail: bool = False) -> list[Part]:
+def worth_parts(worth: Worth | None, *, detail: bool = False) -> Sequence[Part]:
     """Return the picture, the tables and the sentences of what would help.
 
     Args:
-        worth: The record.
+        worth: The record; None for none.
         detail: Whether a short form leaves the tables out.
     """
+    if worth is None:
+        return ()
     present = [each for each in worth.sensors if not each.is_added]
     added = [each for each in worth.sensors if each.is_added]
     added.sort(key=lambda each: worth.ratio(each.present))
