@@ -63,6 +63,11 @@ def record(kind: type[T]) -> type[T]:
     return dataclass(frozen=True, kw_only=True, eq=not arrays, repr=not has_repr)(kind)
 
 
+def finite_or_nan(values: Array) -> Array:
+    """Return the finite ones of some values, and NaN in the place of others."""
+    return np.where(np.isfinite(values), values, np.nan)
+
+
 def freeze(record: object, *names: str) -> None:
     """Replace named fields of a frozen record by read-only float64 arrays.
 

@@ -23,7 +23,7 @@ from mjfim.experiment.system import labels_of_system
 from mjfim.files import write_json
 from mjfim.model.coordinates import split_unit
 from mjfim.output import rerun as rerun_log
-from mjfim.output.archive import write_design
+from mjfim.output.archive import write_data
 from mjfim.output.plots.pictures import draw
 from mjfim.records.studies import MonteCarloStudy
 from scripts.benchmarks.child import ROOT, new_table, options_of
@@ -137,7 +137,7 @@ def main() -> None:
     # Files.
     folder, labels = args.output, labels_of_system(task.system)
     folder.mkdir(parents=True, exist_ok=True)
-    write_design(folder, design, task.system)
+    write_data(folder, design, task.system)
     write_json(folder / "montecarlo_25Hz.json", study.summary())
     for name, file in FIGURES.items():
         draw(study if name.startswith("histogram") else design, name, folder / f"{file}.png")

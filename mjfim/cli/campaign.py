@@ -61,7 +61,7 @@ def campaign(
     stated = mjfim.Experiment.from_file(experiment)
 
     from mjfim.excitation.task import DesignTask
-    from mjfim.experiment.packing import input_files, with_model
+    from mjfim.experiment.packing import with_model
     from mjfim.output.campaign_folder import CampaignFolder, campaign_settings
     from mjfim.output.pages.studies import campaign_page
     from mjfim.records.campaign import CampaignStatus
@@ -74,7 +74,7 @@ def campaign(
     if simulated:
         _require_simulation(folder, task.experiment, settings, resume=resume)
     names = folder.next_files(simulated=simulated)
-    run.claim(names, input_files(task.experiment, recordings or []))
+    run.claim(mjfim.Campaign, task.experiment, recordings or (), names)
 
     with run.workers() as workers, progress("designing") as display:
         lab = _Lab(task=task, folder=folder, display=display, rounds=rounds)
@@ -161,15 +161,15 @@ class _Lab:
     def write(self, design: mjfim.Design, number: int, settings: dict[str, Any]) -> None:
         """Write the design of a round, and the experiment with which it was made."""
         from mjfim.files import write_json
-        from mjfim.output.archive import write_design
-        from mjfim.output.campaign_folder import SETTINGS_FILE
+        from mjfim.output.archive import write_data
+        from mjfim.output.folders import SETTINGS_FILE
         from mjfim.studies.campaign import restate_experiment
 
         # A call that continues the campaign needs the settings as soon as there is a round.
         if settings and not self.folder.has_rounds:
             write_json(self.folder.path / SETTINGS_FILE, settings)
         experiment = restate_experiment(self.task, design.theta, self.estimate)
-        write_design(self.folder.round(number), design, self.task.restated(experiment).system)
+        write_data(self.folder.round(number), design, self.task.restated(experiment).system)
 
     def record(self, design: mjfim.Design, number: int, seed: int) -> mjfim.Recording:
         """Simulate the recording of a round, write it, and read it as --resume does."""

@@ -26,15 +26,12 @@ def check(
 ) -> None:
     """Say which parameters can be identified, how accurately, and which only in combination."""
     stated = mjfim.Experiment.from_file(experiment)
-    has_folder = bool(run.output)
-    if has_folder:
+    if run.output:
         draw_elsewhere()
 
     from mjfim.experiment.given import check_fits, recordings_of
-    from mjfim.experiment.packing import input_files
     from mjfim.experiment.system import System
     from mjfim.output import archive
-    from mjfim.output.folders import CHECK_FILES
 
     system = System.resolve(stated, threads=run.threads)
     with progress("reading"):
@@ -43,8 +40,7 @@ def check(
     if design_file is not None:
         trajectory = archive.read_design(design_file)["final"]
         check_fits(design_file, trajectory, system)
-    if has_folder:
-        run.claim(CHECK_FILES, input_files(stated, [*(recordings or []), design_file]))
+    run.claim(mjfim.Check, stated, [*(recordings or []), design_file])
 
     with run.workers() as workers, progress("checking"):
         result = mjfim.check(stated, loaded, trajectory, threads=run.threads, executor=workers)

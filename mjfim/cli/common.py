@@ -35,7 +35,7 @@ from mjfim.errors import (
 from mjfim.files import observed_by, remove_temporary_files
 from mjfim.output.live import ADDRESS, HERE
 from mjfim.output.manifest import write_optional
-from mjfim.output.page import REPORT, Page, PictureFormat, Section
+from mjfim.output.page import REPORT, Page, Part, PictureFormat
 from mjfim.output.video import require_format, write_video
 from mjfim.parallel.budget import (
     INTERRUPTED_CODE,
@@ -237,14 +237,32 @@ class Run:
 
             StatedExecutor.parse(self.executor)  # a fault is said before the work
 
-    def claim(self, names: Iterable[str], inputs: Sequence[Path]) -> None:
-        """Make sure before the work that results can be written, and keep other runs out.
+    def claim(
+        self,
+        kind: type[ShownRecord],
+        experiment: mjfim.Experiment | None,
+        read: Iterable[Path | None] = (),
+        further: Iterable[str] = (),
+        video: Path | None = None,
+    ) -> None:
+        """Make sure before the work that a result can be written, and keep other runs out.
 
         Args:
-            names: Files that the verb may write, with pictures as PNG.
-            inputs: Files that the verb reads, which it must not replace.
+            kind: The kind of the result.
+            experiment: The experiment, whose files must not be replaced.
+            read: Other files and folders that the verb reads, likewise.
+            further: Files beside those that every result of this kind may have.
+            video: A video that the user wants.
         """
-        claim_folder(self.output, self.pictures.files(names), inputs, force=self.force)
+        if self.output:
+            from mjfim.experiment.packing import input_files
+            from mjfim.output.folders import matching, names_of
+
+            inputs = input_files(experiment, read)
+            claim_video(video, inputs, force=self.force)
+            present = matching(self.output, names_of(kind, self.pictures))
+            names = [*(file.name for file in present), *further]
+            claim_folder(self.output, names, inputs, force=self.force)
 
     @contextmanager
     def workers(self, tasks: int = MAX_PARTS, processes: int = 0) -> Iterator[Workers | None]:
@@ -292,7 +310,7 @@ class Run:
         *,
         design: Path | None = None,
         further: Mapping[str, object] = NOTHING,
-        sections: Iterable[Section] = (),
+        sections: Mapping[str, Sequence[Part]] = MappingProxyType({}),
         remarks: Iterable[str] = (),
     ) -> int:
         """Write the files of a result where there is a folder, print it, and draw its pictures.
@@ -323,7 +341,7 @@ class Run:
             # It is printed after it is written, also where it cannot be written.
             source = None if system is None else system.experiment.source
             page = page_of(result, experiment=source, design=design, output=self.output)
-            page = replace(page, sections=[*page.sections, *sections])
+            page = replace(page, sections={**page.sections, **sections})
             values = {**summary_with_origin(result, system, self.output), **further}
             print_result(self.as_json, values, page, verbose=self.verbose)
             if not page.verdict.ok and (self.as_json or not out.is_terminal):
@@ -361,27 +379,27 @@ def print_result(
 
 
 def claim_folder(
-    folder: Path, names: Iterable[str], inputs: Sequence[Path], *, force: bool
+    folder: Path,
+    names: Iterable[str],
+    inputs: Sequence[Path],
+    *,
+    force: bool,
+    exclusive: bool = True,
 ) -> None:
-    """Make sure before the work that results can be written, and keep other runs out."""
-    from mjfim.output.folders import check_folder
-    from mjfim.output.manifest import OutputGuard, claimed
+    """Make sure before the work that results can be written; exclusive: keep other runs out."""
+    from mjfim.output.manifest import OutputGuard, claimed, require_writable
 
-    check_folder(folder)
+    require_writable(folder)
     guard = OutputGuard(inputs, force=force)
     guard.check(folder / name for name in names)
-    _claims.enter_context(claimed(folder, guard, exclusive=True))
+    _claims.enter_context(claimed(folder, guard, exclusive=exclusive))
 
 
 def claim_file(file: Path, inputs: Sequence[Path], *, force: bool) -> None:
     """Make sure before the work that a single file can be written."""
-    from mjfim.output.folders import check_file
-    from mjfim.output.manifest import OutputGuard, claimed
-
-    check_file(file)
-    guard = OutputGuard(inputs, force=force)
-    guard.check([file])
-    _claims.enter_context(claimed(file.parent, guard, exclusive=False))
+    if file.is_dir():
+        raise RecordingError(f"{file}: is a folder; -o and --save need a file here")
+    claim_folder(file.parent, [file.name], inputs, force=force, exclusive=False)
 
 
 def claim_video(video: Path | None, inputs: Sequence[Path], *, force: bool) -> None:

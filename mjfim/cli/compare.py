@@ -38,16 +38,15 @@ def compare(
     """
     stated = mjfim.Experiment.from_file(experiment)
 
-    from mjfim.experiment.packing import input_files
     from mjfim.experiment.system import System
-    from mjfim.output.folders import comparison_files
     from mjfim.studies.compare import chosen_methods
 
     system = System.resolve(stated, threads=run.threads)
     chosen = None
     if methods is not None:
         chosen = [name.strip() for name in methods.split(",") if name.strip()]
-    run.claim(comparison_files(chosen_methods(system, chosen)), input_files(stated))
+    controls = (f"control_{name}.csv" for name in chosen_methods(system, chosen))
+    run.claim(mjfim.Comparison, stated, further=(*controls, "control_design.csv"))
 
     with run.workers() as workers, progress("comparing") as show:
         result = mjfim.compare(

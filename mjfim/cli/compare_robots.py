@@ -39,11 +39,9 @@ def compare_robots(
     """
     from dataclasses import replace
 
-    from mjfim.output.folders import ROBOT_FILES
-
     estimates = [mjfim.Estimate.load(folder) for folder in (first, second)]
     inputs = [folder / name for folder in (first, second) for name in ESTIMATE_FILES]
-    run.claim(ROBOT_FILES, inputs)
+    run.claim(mjfim.RobotComparison, None, inputs)
     result = mjfim.compare_estimates(*estimates, names=_names(first, second))
     result = replace(result, remarks=(*result.remarks, *_differences_of_files(first, second)))
 

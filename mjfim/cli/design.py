@@ -13,7 +13,6 @@ from mjfim.cli.common import (
     LiveView,
     Run,
     VideoFile,
-    claim_video,
     draw_elsewhere,
     verb,
     write_wanted_video,
@@ -54,9 +53,7 @@ def design(
     from mjfim.excitation.shortest_horizon import OutOfReachError
     from mjfim.excitation.task import DesignTask
     from mjfim.excitation.task_parts import require_design_keys
-    from mjfim.experiment.packing import input_files
     from mjfim.experiment.system import System
-    from mjfim.output.folders import DESIGN_FILES, SHORTEST_FILES
 
     if starts is not None:
         stated = stated.replace(descent={"starts": starts})
@@ -68,8 +65,8 @@ def design(
     require_design_keys(system)
     task = DesignTask.of(system)
 
-    claim_video(video, input_files(stated), force=run.force)
-    run.claim((*DESIGN_FILES, *(SHORTEST_FILES if shortest else ())), input_files(stated))
+    names = ("shortest.json", "shortest.npz") if shortest else ()
+    run.claim(mjfim.Design, stated, further=names, video=video)
 
     found = None
     with ExitStack() as during:

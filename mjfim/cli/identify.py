@@ -15,7 +15,6 @@ from mjfim.cli.common import (
     LiveView,
     Run,
     VideoFile,
-    claim_video,
     verb,
     write_wanted_video,
 )
@@ -86,10 +85,10 @@ def identify(
     if select and method == "newton":
         raise ExperimentError("--select: fits with the method least_squares only, not newton")
 
-    from mjfim.experiment.packing import input_files, with_model
+    from mjfim.experiment.packing import with_model
     from mjfim.experiment.system import System
-    from mjfim.output.folders import estimate_files, parts_of_identified, sample_files
-    from mjfim.output.pages.files import log_section
+    from mjfim.output.folders import identified_models, sample_files
+    from mjfim.output.pages.files import log_tables
     from mjfim.recordings.read import read_log, recording_paths
     from mjfim.records.check import Check
     from mjfim.records.design import Design
@@ -100,18 +99,12 @@ def identify(
         kind = Check if (predicted / "check.npz").is_file() else Design
         prediction = kind.load(predicted)
     system = System.resolve(stated, threads=run.threads)
-    inputs = input_files(stated, [*recordings, *(held_out or [])])
     fitted_paths = recording_paths(recordings, system.channels)
     held_out_paths = recording_paths(held_out or [], system.channels)
-    names = (
-        *estimate_files(
-            len(fitted_paths), len(held_out_paths), select=select, samples=bool(samples)
-        ),
-        *parts_of_identified(run.output, system.model_path),
-        *sample_files(run.output, samples or 0, system.model_path),
-    )
-    claim_video(video, inputs, force=run.force)
-    run.claim(names, inputs)
+    models = identified_models(run.output, system.model_path)
+    drawn = sample_files(run.output) if samples else ()
+    logs_read = [*recordings, *(held_out or [])]
+    run.claim(mjfim.Estimate, stated, logs_read, (*models, *drawn), video)
 
     with progress("reading"):
         logs = [read_log(path, system.channels) for path in (*fitted_paths, *held_out_paths)]
@@ -134,7 +127,7 @@ def identify(
     if samples:
         result, not_drawn = _with_draws(result, system, samples, seed)
 
-    sections = [log_section([log.summary for log in logs])] if run.verbose else []
+    sections = {"Logs": log_tables([log.summary for log in logs])} if run.verbose else {}
     remarks = [f"warning: --samples: no robots were drawn{not_drawn}"] if not_drawn else []
     code = run.finish(result, system, sections=sections, remarks=remarks)
     write_wanted_video(video, system, result)

@@ -31,16 +31,14 @@ def montecarlo(
         stated = stated.replace(measure_rate=measure_rate)
 
     from mjfim.experiment.given import check_fits
-    from mjfim.experiment.packing import input_files
     from mjfim.experiment.system import System
     from mjfim.output import archive
-    from mjfim.output.folders import study_files
 
     system = System.resolve(stated, threads=run.threads)
     named = archive.read_design(design_file)
     for trajectory in named.values():
         check_fits(design_file, trajectory, system)
-    run.claim(study_files(system.parameters.names), input_files(stated, [design_file]))
+    run.claim(mjfim.MonteCarloStudy, stated, [design_file])
 
     with (
         run.workers(trials) as workers,

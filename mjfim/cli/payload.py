@@ -66,8 +66,8 @@ def payload(
     """
     stated = mjfim.Experiment.from_file(experiment)
 
-    from mjfim.experiment.packing import input_files, with_model
-    from mjfim.output.folders import estimate_files, parts_of_identified
+    from mjfim.experiment.packing import with_model
+    from mjfim.output.folders import identified_models
     from mjfim.recordings.read import read_log, recording_paths
     from mjfim.studies.payload import PayloadTask
 
@@ -83,8 +83,8 @@ def payload(
     system = task.system()
     paths = recording_paths(recordings, system.channels)
     unloaded = recording_paths(without or [], system.channels)
-    names = (*estimate_files(len(paths)), *parts_of_identified(run.output, system.model_path))
-    run.claim(names, input_files(stated, [*recordings, *(without or []), robot]))
+    models = identified_models(run.output, system.model_path)
+    run.claim(mjfim.Estimate, stated, [*recordings, *(without or []), robot], models)
 
     with progress("reading"):
         logs = [read_log(path, system.channels).recording for path in (*paths, *unloaded)]

@@ -49,13 +49,10 @@ def rehearse(
         rehearsal={key: value for key, value in changed.items() if value is not None}
     )
 
-    from mjfim.experiment.packing import input_files
     from mjfim.experiment.system import System
-    from mjfim.output.folders import REHEARSAL_FILES
 
     design = mjfim.Design.load(design_file)
-    if run.output:
-        run.claim(REHEARSAL_FILES, input_files(stated, [design_file]))
+    run.claim(mjfim.Rehearsal, stated, [design_file])
     with progress("playing the design"):
         result = mjfim.rehearse(stated, design, threads=run.threads)
     raise typer.Exit(run.finish(result, System.resolve(stated), design=design_file.parent))

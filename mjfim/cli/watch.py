@@ -62,14 +62,11 @@ def watch(
     if stream != STDIN and not (Path(stream).exists() and not Path(stream).is_dir()):
         raise RecordingError(f"{stream}: no such file")
 
-    from mjfim.experiment.packing import input_files
-    from mjfim.output.folders import WATCH_FILES
-
     meter = mjfim.Meter(stated, threads=run.threads)
     if run.output:
         draw_elsewhere()
-        files = [] if stream == STDIN else [Path(stream)]
-        run.claim(WATCH_FILES, input_files(stated, files))
+    files = [] if stream == STDIN else [Path(stream)]
+    run.claim(mjfim.Watch, stated, files)
     with (
         stop_on_interrupt() as stop,
         _table() as table,

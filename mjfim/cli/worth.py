@@ -40,9 +40,8 @@ def worth(
     ] = 60.0,
 ) -> None:
     """Say which sensor, which data and which limit would make the parameters more accurate."""
-    from mjfim.experiment.packing import input_files
     from mjfim.experiment.system import System
-    from mjfim.output.folders import WORTH_FILES, find_experiment_file
+    from mjfim.output.folders import find_experiment_file
 
     is_design = source.is_dir() or source.suffix == ".npz"
     file = source / "design.npz" if source.is_dir() else source
@@ -53,7 +52,7 @@ def worth(
     added = dict(map(_sensor, add or []))
     if run.output:
         draw_elsewhere()
-        run.claim(WORTH_FILES, input_files(stated, [file]))
+    run.claim(mjfim.Worth, stated, [file])
     with progress("comparing"):
         result = mjfim.worth(stated, design, add=added, seconds=seconds, threads=run.threads)
     run.finish(result, System.resolve(stated), design=file.parent if is_design else None)

@@ -13,16 +13,20 @@ from mjfim.model.loading import ModelSource, packed_model
 from mjfim.model.model_files import PackedFiles, files_of_model
 
 
-def input_files(experiment: Experiment, further: Iterable[Path | None] = ()) -> tuple[Path, ...]:
+def input_files(
+    experiment: Experiment | None, further: Iterable[Path | None] = ()
+) -> tuple[Path, ...]:
     """List the files of an experiment and of a call, none of which a result may replace.
 
     Args:
-        experiment: The experiment.
+        experiment: The experiment; None for a call without one.
         further: Files and folders of the call, such as recordings; None for those it lacks.
     """
-    model = experiment.directory / experiment.model
-    files = [Path(experiment.source), *files_of_model(model)]
-    files += [experiment.directory / name for name in experiment.tables]
+    files = []
+    if experiment is not None:
+        model = experiment.directory / experiment.model
+        files = [Path(experiment.source), *files_of_model(model)]
+        files += [experiment.directory / name for name in experiment.tables]
     for path in further:
         if path is not None:
             files += sorted(path.iterdir()) if path.is_dir() else [path]

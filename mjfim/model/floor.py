@@ -97,7 +97,7 @@ def _geom_heights(model: Any, poses: Sequence[Pose], geoms: NDArray[np.intp]) ->
             points = model.mesh_vert[first : first + int(model.mesh_vertnum[mesh])]
             reach = (points @ down.T).max(axis=0)
         lowest[below] = np.minimum(lowest[below], height[below, i] - reach)
-    return np.asarray(lowest)
+    return lowest
 
 
 def find_floor(model: Any, qpos: Array, stated: float | None = None) -> Floor:

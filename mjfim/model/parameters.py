@@ -470,14 +470,12 @@ def _require_compatible(parameter: Parameter, parametrisations: set[str], arrays
 
 def _require_one_owner(parameters: Sequence[Parameter]) -> None:
     """Raise where two targets write one number."""
-    owner_of_field: dict[TargetField, str] = {}
-    owner_of_number: dict[tuple[str, int, int], str] = {}
-
+    owners: dict[object, str] = {}
     for parameter in parameters:
         for target in parameter.targets:
-            numbers = target.field.numbers if isinstance(target.field, ModelField) else set()
-            owners = [owner_of_number[number] for number in numbers if number in owner_of_number]
-            other = owner_of_field.get(target.field) or next(iter(owners), None)
+            # A field that is written as a whole counts as one number.
+            numbers = getattr(target.field, "numbers", {target.field})
+            other = next((owners[number] for number in numbers if number in owners), None)
             if other is not None:
                 raise _parameter_error(
                     parameter,
@@ -485,8 +483,7 @@ def _require_one_owner(parameters: Sequence[Parameter]) -> None:
                     "parameters cannot set one number",
                 )
 
-            owner_of_field[target.field] = parameter.name
-            owner_of_number |= dict.fromkeys(numbers, parameter.name)
+            owners |= dict.fromkeys(numbers, parameter.name)
 
 
 def _require_movable(

@@ -506,7 +506,7 @@ def _element_field(model: Any, path: ParameterPath, decoration: Collection[str])
             raise path.error("the size of a mesh or height field is not a number of the geom")
         if field in ("size", "pos") and path.name in decoration:
             return ModelField(array=f"geom_{field}", rows=(number,), column=index)
-        return SpecField(path.kind, path.name, field, index)
+        return SpecField(path.name, field, index)
 
     if path.kind == "actuator" and field in SERVO_FIELDS:
         return _servo_field(model, path, number)

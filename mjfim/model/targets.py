@@ -181,18 +181,16 @@ class RotationField(DeviationField):
 
 @dataclass(frozen=True)
 class SpecField:
-    """A number of the MJCF from which the compiler derives others.
+    """A number of a geom in the MJCF from which the compiler derives others.
 
     A change of such a number needs a compile.
 
     Attributes:
-        kind: Kind of the element.
-        name: Name of the element.
-        field: Field of the element in MjSpec.
+        name: Name of the geom.
+        field: Field of the geom in MjSpec.
         index: Place in the field.
     """
 
-    kind: str
     name: str
     field: str
     index: int

@@ -34,6 +34,7 @@ from mjfim.plant.batch import BatchSimulator
 from mjfim.plant.state_space import logarithm
 from mjfim.records.base import ShownRecord
 from mjfim.records.design import TRAJECTORY_ARRAYS, Design
+from mjfim.records.studies import Comparison
 from mjfim.records.trajectory import Labels, Playback, Recording, Trajectory
 
 # Angle of a whole turn [rad].
@@ -187,28 +188,46 @@ MIN_ROWS = 3
 SPACING_TOLERANCE = 1e-3
 
 
-def write_design(
-    folder: Path, design: Design, system: System, further: Mapping[str, object] | None = None
+def write_data(
+    folder: Path,
+    record: ShownRecord,
+    system: System | None = None,
+    further: Mapping[str, object] | None = None,
 ) -> None:
-    """Write design.npz, design.csv, reference.csv and design.json, each complete or not at all.
+    """Write the JSON file, the npz file and the tables of a result, each complete or not at all.
 
-    `Design.load` reads the design back. design.json names the experiment file and
-    its model, relative to the folder.
+    A design has the tables design.csv and reference.csv, a comparison a control of each method. The
+    JSON file names the experiment file and its model, relative to the folder.
 
     Args:
         folder: Folder for the files; made if it does not exist.
-        design: The design.
-        system: The experiment for which it was made.
-        further: Further entries of design.json.
+        record: The result.
+        system: Its experiment; None for a comparison of robots.
+        further: Further entries of the JSON file.
     """
-    playback = simulate_playback(system, design.trajectory, design.final.gain)
+    tables = {} if system is None else _tables(record, system)
+    record.save_archive(folder)
+    for name, columns in tables.items():
+        write_table(folder / f"{name}.csv", columns)
+    values = {**summary_with_origin(record, system, folder), **(further or {})}
+    write_json(folder / f"{record.file_stem}.json", values)
 
-    design.save_archive(folder)
-    write_table(folder / "design.csv", design_columns(playback, system))
-    write_table(folder / "reference.csv", reference_columns(playback, system))
 
-    values = {**origin_of(system, folder), **design.summary(), **(further or {})}
-    write_json(folder / "design.json", values)
+def _tables(record: ShownRecord, system: System) -> dict[str, Mapping[str, np.ndarray]]:
+    """The columns of the tables of a result, by the names of the tables."""
+    if isinstance(record, Design):
+        playback = simulate_playback(system, record.trajectory, record.final.gain)
+        return {
+            "design": design_columns(playback, system),
+            "reference": reference_columns(playback, system),
+        }
+    if isinstance(record, Comparison):
+        return {
+            f"control_{row.method}": control_columns(row.control, system)
+            for row in record.rows
+            if row.control is not None
+        }
+    return {}
 
 
 def summary_with_origin(
@@ -221,25 +240,15 @@ def summary_with_origin(
         system: The experiment of the result; None for a comparison of robots.
         folder: Folder of results, relative to which files are named; without one, none are.
     """
-    origin = {} if system is None or folder is None else origin_of(system, folder)
-    return {**origin, **record.summary()}
-
-
-def origin_of(system: System, folder: Path) -> dict[str, str | None]:
-    """Return the files of an experiment and of its model, relative to a folder of results.
-
-    Args:
-        system: The experiment.
-        folder: The folder.
-
-    Returns:
-        The paths, with slashes; None for an experiment that is no file.
-    """
+    if system is None or folder is None:
+        return record.summary()
+    # An experiment that is no file has no name.
     files = {"experiment": Path(system.experiment.source), "model": system.model_path}
-    return {
+    origin = {
         name: relative_name(file, folder) if file.is_file() else None
         for name, file in files.items()
     }
+    return {**origin, **record.summary()}
 
 
 def write_table(path: Path, columns: Mapping[str, np.ndarray]) -> None:
@@ -260,16 +269,10 @@ def write_table(path: Path, columns: Mapping[str, np.ndarray]) -> None:
         pyarrow.csv.write_csv(pyarrow.table(arrays), temporary, options)
 
 
-def write_control(path: Path, control: Array, system: System) -> None:
-    """Write a control as a table that `initial.control` of an experiment reads.
-
-    Args:
-        path: CSV file to write.
-        control: (N, nu) control [unit of the actuator].
-        system: The experiment, which names the actuators.
-    """
+def control_columns(control: Array, system: System) -> dict[str, Array]:
+    """Return the columns of a control: (N, nu), as `initial.control` reads them."""
     t = np.arange(len(control), dtype=np.float64) * system.dt
-    write_table(path, {"t": t, **dict(zip(system.controls, control.T, strict=True))})
+    return {"t": t, **dict(zip(system.controls, control.T, strict=True))}
 
 
 def write_recording(path: Path, recording: Recording, system: System) -> None:

@@ -22,13 +22,14 @@ from mjfim.experiment.given import check_fits
 from mjfim.experiment.packing import input_files
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
-from mjfim.files import as_json, read_json, replacing, write_json
-from mjfim.output.archive import origin_of
+from mjfim.files import as_json, read_json, replacing
+from mjfim.output.archive import write_data
 from mjfim.output.export.mjcf import write_identified
 from mjfim.output.folders import (
     DESIGN_ARCHIVE,
     IDENTIFIED,
-    parts_of_identified,
+    SETTINGS_FILE,
+    identified_models,
     write_pictures,
 )
 from mjfim.output.manifest import fingerprint, write_optional
@@ -41,19 +42,6 @@ from mjfim.recordings.read import read_recording
 from mjfim.records.campaign import Campaign, EarlierRound
 from mjfim.records.design import Design
 from mjfim.records.estimate import Estimate
-
-# The settings with which a simulated campaign began; the call that continues it needs the same.
-SETTINGS_FILE = "settings.json"
-
-# Files of a campaign beside the folders of its rounds.
-CAMPAIGN_FILES = (
-    SETTINGS_FILE,
-    "campaign.json",
-    "campaign.npz",
-    REPORT,
-    "campaign.png",
-    IDENTIFIED,
-)
 
 # Files of the estimate after a round.
 ESTIMATE_ARCHIVE = ("estimate.json", "estimate.npz")
@@ -112,7 +100,7 @@ class CampaignFolder:
         return sum(1 for _ in itertools.takewhile(self.recordings, range(1, self.designed + 1)))
 
     def next_files(self, *, simulated: bool) -> list[str]:
-        """List the files that the next call may write; in the folders of rounds, existing ones.
+        """List the models, and the files in folders of rounds, that the next call may replace.
 
         Args:
             simulated: Whether recordings are simulated, too.
@@ -120,8 +108,7 @@ class CampaignFolder:
         Returns:
             Names relative to the folder.
         """
-        files = self.picture_format.files(CAMPAIGN_FILES)
-        names = [*files, *parts_of_identified(self.path, self.system.model_path)]
+        names = [*identified_models(self.path, self.system.model_path)]
         designed, recorded = self.designed, self.recorded
         for place in self.path.glob("round_*"):
             number = int(place.name.removeprefix("round_") or 0)
@@ -205,15 +192,8 @@ class CampaignFolder:
             Sentences about the identified model.
         """
         true = self.system.parameters.true if simulated else None
-        campaign.save_archive(self.path)
-        values = {
-            **origin_of(self.system, self.path),
-            **campaign.summary(),
-            "simulated": simulated,
-            "units": list(self.system.units),
-            "true": true,
-        }
-        write_json(self.path / "campaign.json", values)
+        further = {"simulated": simulated, "units": list(self.system.units), "true": true}
+        write_data(self.path, campaign, self.system, further)
         write_optional(REPORT, lambda: write_report(self.path))
         if campaign.estimate is None:
             return []

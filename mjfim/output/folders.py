@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import re
 from collections import Counter
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping
 from functools import partial
 from pathlib import Path
 
@@ -13,7 +13,7 @@ import numpy as np
 
 from mjfim.errors import ModelError, RecordingError
 from mjfim.experiment.system import System, labels_of_system
-from mjfim.files import read_json, remove_earlier_result, replacing, write_json
+from mjfim.files import read_json, remove_earlier_result, replacing
 from mjfim.output import archive
 from mjfim.output import rerun as rerun_log
 from mjfim.output.archive import write_table
@@ -27,8 +27,6 @@ from mjfim.output.plots.pictures import (
     ON_REQUEST,
     Pictures,
     begin_pictures,
-    histogram_name,
-    numbered,
     pictures_of,
     usual,
 )
@@ -36,10 +34,12 @@ from mjfim.output.report import Media, kinds_in, write_report
 from mjfim.output.video import report_video
 from mjfim.parallel.budget import current_interruption
 from mjfim.records.base import ShownRecord
+from mjfim.records.campaign import Campaign
+from mjfim.records.check import Check
 from mjfim.records.design import Design
 from mjfim.records.estimate import Estimate
 from mjfim.records.events import begin_stage
-from mjfim.records.studies import DESIGN, Comparison
+from mjfim.records.studies import Comparison, MonteCarloStudy
 
 # Table of the drawn robots, and folder of their models.
 SAMPLES_TABLE = "samples.csv"
@@ -51,23 +51,10 @@ ROBOT = "robot_{:04d}"
 SAMPLE_FILES = r"robot_\d+(_.*)?\.(xml|urdf)"
 
 
-def sample_files(folder: Path, count: int, model: Path) -> tuple[str, ...]:
-    """List the files of drawn robots, relative to the folder of the estimate.
-
-    Args:
-        folder: Folder of the estimate.
-        count: Number of robots; without any, there are no files.
-        model: The user's model.
-    """
-    if not count:
-        return ()
-
-    # The names of all files begin with the name of the robot.
-    first = ROBOT.format(1)
-    others = identified_files(folder / SAMPLES_FOLDER / f"{first}.xml", model)
-    endings = [".xml", *(name.removeprefix(first) for name in others)]
-    robots = [f"{SAMPLES_FOLDER}/{ROBOT.format(i + 1)}" for i in range(count)]
-    return (SAMPLES_TABLE, *(f"{robot}{ending}" for robot in robots for ending in endings))
+def sample_files(folder: Path) -> tuple[str, ...]:
+    """List the files of drawn robots in the folder of an estimate, relative to it."""
+    models = matching(folder / SAMPLES_FOLDER, SAMPLE_FILES)
+    return (SAMPLES_TABLE, *(f"{SAMPLES_FOLDER}/{file.name}" for file in models))
 
 
 def write_samples(folder: Path, estimate: Estimate, system: System) -> list[str]:
@@ -133,95 +120,58 @@ def _clear_models(place: Path) -> None:
 # The identified model.
 IDENTIFIED = "identified.xml"
 
-# Names of files of an earlier run that may not be written again, by the kind of the result.
+# Names of the pictures of a result without their endings, as patterns, where they are not those of
+# its other files.
 ENDINGS = "|".join(PictureFormat)
-STALE: dict[type[ShownRecord], str] = {
-    Comparison: r"control_[\w-]+\.csv",
-    Design: rf"({'|'.join(DESIGN_PICTURES)})\.({ENDINGS})",
-    Estimate: rf"((fit|held_out)(_\d+)?|{'|'.join(ESTIMATE_PICTURES)})\.({ENDINGS})"
-    r"|identified(_.*)?\.(xml|urdf)",
+PICTURES: dict[type[ShownRecord], str] = {
+    Check: "check|worth|rehearsal|valley",
+    Design: "|".join(DESIGN_PICTURES),
+    Estimate: rf"(fit|held_out)(_\d+)?|{'|'.join(ESTIMATE_PICTURES)}",
+    MonteCarloStudy: "overview|histogram_.*",
 }
 
-# Files that a design consists of, without figures.
+# Names of files of an earlier run that may not be written again.
+STALE: dict[type[ShownRecord], str] = {
+    Comparison: r"control_[\w-]+\.csv",
+    Design: rf"({PICTURES[Design]})\.({ENDINGS})",
+    Estimate: rf"({PICTURES[Estimate]})\.({ENDINGS})|identified(_.*)?\.(xml|urdf)",
+}
+
+# Files that a design consists of, without figures; and the settings with which a simulated campaign
+# began: the call that continues it needs the same.
 DESIGN_ARCHIVE = ("design.npz", "design.csv", "reference.csv", "design.json")
+SETTINGS_FILE = "settings.json"
 
-# Files that `mjfim design` may write, and further ones with --shortest. The names of pictures in
-# these lists end in .png; `PictureFormat.files` has those of another format.
-DESIGN_FILES = (
-    *DESIGN_ARCHIVE,
-    REPORT,
-    "design.rrd",
-    *map(PictureFormat.PNG.file_of, DESIGN_PICTURES),
-)
-SHORTEST_FILES = ("shortest.json", "shortest.npz")
-
-# Files that `mjfim check`, `worth`, `watch`, `compare-robots` and `rehearse` may write.
-CHECK_FILES = (
-    "check.json",
-    "check.npz",
-    REPORT,
-    "check.png",
-    "worth.png",
-    "rehearsal.png",
-    "valley.png",
-)
-WORTH_FILES = ("worth.json", "worth.npz", REPORT, "worth.png")
-WATCH_FILES = ("watch.json", "watch.npz", REPORT, "watch.png")
-ROBOT_FILES = ("robots.json", "robots.npz", REPORT, "robots.png")
-REHEARSAL_FILES = ("rehearsal.json", "rehearsal.npz", REPORT, "rehearsal.png")
+# Files beside the data, the report and the pictures of a result.
+FURTHER: dict[type[ShownRecord], str] = {
+    Campaign: SETTINGS_FILE,
+    Design: "|".join(DESIGN_ARCHIVE),
+}
 
 
-def parts_of_identified(folder: Path, model: Path) -> tuple[str, ...]:
-    """List the files that `identified.xml` may include beside it, and the identified URDFs.
+def names_of(kind: type[ShownRecord], picture_format: PictureFormat) -> str:
+    """Return the pattern of the names of all files that a result of a kind may have.
+
+    Those that hold names of the user are not among them; see `identified_models`.
+    """
+    pictures = PICTURES.get(kind, kind.file_stem)
+    data = rf"{kind.file_stem}\.(json|npz|rrd)|{REPORT}|{FURTHER.get(kind, '')}"
+    return rf"{data}|({pictures})\.{picture_format}"
+
+
+def matching(folder: Path, names: str) -> list[Path]:
+    """List the files of a folder whose whole names match a pattern."""
+    return [file for file in folder.glob("*") if re.fullmatch(names, file.name)]
+
+
+def identified_models(folder: Path, model: Path) -> tuple[str, ...]:
+    """List the files of an identified model: the MJCF, what it includes, and URDFs.
 
     Args:
         folder: Folder of `identified.xml`.
         model: The user's MJCF.
     """
-    return identified_files(folder / IDENTIFIED, model)
-
-
-def estimate_files(
-    recordings: int, held_out: int = 0, *, select: bool = False, samples: bool = False
-) -> tuple[str, ...]:
-    """List the files that `mjfim identify` may write for every model.
-
-    Args:
-        recordings: Number of recordings that are fitted.
-        held_out: Number of recordings that are held out.
-        select: Whether terms of the model are selected.
-        samples: Whether robots are drawn, whose models `sample_files` lists.
-    """
-    unwanted = {"selection": not select, "samples": not samples, "recordings": recordings < 2}
-    names = [name for name in ESTIMATE_PICTURES if not unwanted.get(name)]
-    names += [*numbered("fit", recordings), *numbered("held_out", held_out)]
-    data = ("estimate.json", "estimate.npz", IDENTIFIED, REPORT, "estimate.rrd")
-    return (*data, *map(PictureFormat.PNG.file_of, names))
-
-
-def study_files(parameters: Iterable[str]) -> tuple[str, ...]:
-    """List the files that `mjfim montecarlo` may write.
-
-    Args:
-        parameters: Names of the parameters.
-    """
-    histograms = (PictureFormat.PNG.file_of(histogram_name(name)) for name in parameters)
-    return ("montecarlo.json", "montecarlo.npz", REPORT, "overview.png", *histograms)
-
-
-def comparison_files(methods: Sequence[str]) -> tuple[str, ...]:
-    """List the files that `mjfim compare` may write.
-
-    Args:
-        methods: Keys of the baselines.
-    """
-    controls = tuple(control_name(method) for method in dict.fromkeys((*methods, DESIGN)))
-    return ("compare.json", "compare.npz", REPORT, "compare.png", *controls)
-
-
-def control_name(method: str) -> str:
-    """Name of the table with the control of a method."""
-    return f"control_{method}.csv"
+    return (IDENTIFIED, *identified_files(folder / IDENTIFIED, model))
 
 
 def find_rerun_file(source: Path) -> Path:
@@ -277,36 +227,6 @@ def find_experiment_file(source: Path) -> Path:
     return found.relative_to(Path.cwd()) if found.is_relative_to(Path.cwd()) else found
 
 
-def check_folder(folder: Path) -> None:
-    """Check before the work, not after it, that results can be written to a folder.
-
-    Args:
-        folder: The folder; it need not exist yet.
-
-    Raises:
-        RecordingError: It is a file, or writing is not permitted.
-    """
-    existing = next(p for p in (folder, *folder.absolute().parents) if p.exists())
-    if not existing.is_dir():
-        raise RecordingError(f"{existing}: is a file; -o needs a folder")
-    if not os.access(existing, os.W_OK):
-        raise RecordingError(f"{existing}: no permission to write here")
-
-
-def check_file(path: Path) -> None:
-    """Check before the work that a file can be written.
-
-    Args:
-        path: The file; it need not exist yet.
-
-    Raises:
-        RecordingError: It is a folder, or writing is not permitted.
-    """
-    if path.is_dir():
-        raise RecordingError(f"{path}: is a folder; -o and --save need a file here")
-    check_folder(path.parent)
-
-
 def write_result(
     folder: Path,
     record: ShownRecord,
@@ -360,17 +280,7 @@ def _write_data(
     folder: Path, record: ShownRecord, system: System | None, further: Mapping[str, object]
 ) -> list[str]:
     """Write the data of a result, and the models that it identifies."""
-    if system is not None and isinstance(record, Design):
-        archive.write_design(folder, record, system, further)
-        return []
-
-    record.save_archive(folder)
-    values = archive.summary_with_origin(record, system, folder)
-    write_json(folder / f"{record.file_stem}.json", {**values, **further})
-    if system is not None and isinstance(record, Comparison):
-        for row in record.rows:
-            if row.control is not None:
-                archive.write_control(folder / control_name(row.method), row.control, system)
+    archive.write_data(folder, record, system, further)
     if system is None or not isinstance(record, Estimate):
         return []
 
@@ -503,6 +413,5 @@ def clear(folder: Path, names: str) -> None:
         folder: The folder.
         names: Regular expression for whole names.
     """
-    for stale in list(folder.glob("*")):
-        if re.fullmatch(names, stale.name):
-            remove_earlier_result(stale)
+    for stale in matching(folder, names):
+        remove_earlier_result(stale)

@@ -175,6 +175,22 @@ def _refusal(unknown: Sequence[Path], changed: Sequence[Path]) -> str:
     return f"{'; '.join(parts)}; {cure}"
 
 
+def require_writable(folder: Path) -> None:
+    """Check before the work, not after it, that results can be written to a folder.
+
+    Args:
+        folder: The folder; it need not exist yet.
+
+    Raises:
+        RecordingError: It is a file, or writing is not permitted.
+    """
+    existing = next(p for p in (folder, *folder.absolute().parents) if p.exists())
+    if not existing.is_dir():
+        raise RecordingError(f"{existing}: is a file; -o needs a folder")
+    if not os.access(existing, os.W_OK):
+        raise RecordingError(f"{existing}: no permission to write here")
+
+
 @contextmanager
 def claimed(folder: Path, guard: OutputGuard, *, exclusive: bool) -> Iterator[None]:
     """Guard all files that are written in the context, and keep other runs out of a folder.

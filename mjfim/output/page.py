@@ -18,11 +18,11 @@ them.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 from itertools import zip_longest
-from typing import NamedTuple, Self
+from typing import Any, NamedTuple, Self
 
 from mjfim.records.verdict import Verdict
 
@@ -44,17 +44,6 @@ class PictureFormat(StrEnum):
             picture: Name of the picture, without an ending.
         """
         return f"{picture}.{self.value}"
-
-    def files(self, names: Iterable[str]) -> tuple[str, ...]:
-        """Return the names of files, where all pictures have this format.
-
-        Args:
-            names: Names of files; those of pictures end in .png.
-        """
-        return tuple(
-            name.removesuffix("png") + self.value if name.endswith(".png") else name
-            for name in names
-        )
 
 
 class Term(str):
@@ -194,14 +183,6 @@ class Plot:
 Part = Table | Text | Listing | Plot
 
 
-@dataclass(frozen=True)
-class Section:
-    """Parts under a heading."""
-
-    title: str
-    parts: Sequence[Part]
-
-
 @dataclass(frozen=True, kw_only=True)
 class Page:
     """A result in words, tables and names of pictures.
@@ -214,7 +195,7 @@ class Page:
         warnings: What limits the result.
         details: Remarks that a short form leaves out.
         facts: Short facts by their names.
-        sections: Sections, the main results first.
+        sections: Parts by their headings, the main results first; those without parts go.
     """
 
     kind: str
@@ -224,9 +205,12 @@ class Page:
     warnings: tuple[str, ...] = ()
     details: tuple[str, ...] = ()
     facts: Mapping[str, str] = field(default_factory=dict)
-    sections: Sequence[Section] = ()
+    sections: Mapping[str, Iterable[Part]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
+        sections = {title: tuple(parts) for title, parts in self.sections.items()}
+        kept = {title: parts for title, parts in sections.items() if parts}
+        object.__setattr__(self, "sections", kept)
         verdict = self.verdict._replace(
             sentence=capitalised(self.verdict.sentence),
             reasons=(*self.causes, *self.warnings),
@@ -242,8 +226,8 @@ class Page:
     @property
     def every_part(self) -> Iterator[Part]:
         """All parts, in their order."""
-        for section in self.sections:
-            yield from section.parts
+        for parts in self.sections.values():
+            yield from parts
 
     @property
     def parts(self) -> Iterator[Table | Text | Listing]:
@@ -285,6 +269,20 @@ def numbers(
 def named(name: str, unit: str) -> str:
     """Write a name with its unit."""
     return f"{name} ({unit})" if unit else name
+
+
+def parameter_names(
+    of: Any, chosen: Iterable[int] | None = None, write: Callable[[str, str], str] = named
+) -> list[str]:
+    """Write the names of the parameters of a result with their units.
+
+    Args:
+        of: The result, with `parameters` and `units`.
+        chosen: Numbers of the parameters; default: all.
+        write: Writes a name with its unit.
+    """
+    every = list(map(write, of.parameters, of.units))
+    return every if chosen is None else [every[j] for j in chosen]
 
 
 def tabulated(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import field, replace
+from functools import partial
 from typing import Any, Literal
 
 import numpy as np
@@ -165,7 +166,6 @@ class Panel:
         cells: Coloured cells.
         place: Row and column in the picture.
         is_wide: Whether it takes all columns.
-        is_tall: Whether it takes all rows.
         is_shaded: Whether its background is grey.
     """
 
@@ -180,7 +180,6 @@ class Panel:
     cells: Cells | None = None
     place: tuple[int, int] = (0, 0)
     is_wide: bool = False
-    is_tall: bool = False
     is_shaded: bool = False
 
 
@@ -219,14 +218,9 @@ def mark(kind: Kind, x: Numbers, y: Numbers, role: str, **look: Any) -> Mark:
     return Mark(kind=kind, x=next(places), y=next(places), role=role, **look)
 
 
-def line(x: Numbers, y: Numbers, role: str, **look: Any) -> Mark:
-    """Return a line through points."""
-    return mark("line", x, y, role, **look)
-
-
-def dots(x: Numbers, y: Numbers, role: str, **look: Any) -> Mark:
-    """Return dots."""
-    return mark("dots", x, y, role, **{"symbol": "o", **look})
+# Lines through points, and dots.
+line = partial(mark, "line")
+dots = partial(mark, "dots", symbol="o")
 
 
 def area(x: Numbers, low: Array, high: Array, role: str, **look: Any) -> Mark:

@@ -113,6 +113,9 @@ PACKAGE, TEMPLATES = "mjfim.output", "templates"
 # Names of commands, keys and files in sentences.
 CODE = re.compile(r"`([^`\n]+)`")
 
+# Characters that Markdown would take for its own marks; an underscore only at the edge of a word.
+MARKS = re.compile(r"[\\|*`<>\[\]~]|(?<!\w)_|_(?!\w)")
+
 # Space between a number and its sign of percent or of a standard deviation.
 UNIT_SPACE = re.compile(r"(?<=\d) (?=[%σ])|(?<=±) (?=\d)")
 
@@ -148,10 +151,18 @@ def template(file: str) -> Template:
     environment.filters.update(
         capital=capitalised,
         kind_of=lambda part: type(part).__name__,
+        markdown=_markdown,
         prose=_prose,
         sentence=as_sentence,
     )
     return environment.get_template(file)
+
+
+def _markdown(text: str) -> Markup:
+    """A text on one line, without a character that Markdown takes for a mark."""
+    from markupsafe import Markup
+
+    return Markup(MARKS.sub(lambda mark: f"\\{mark[0]}", " ".join(text.split())))
 
 
 def _prose(text: str) -> Markup:

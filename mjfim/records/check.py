@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from mjfim.arrays import NORMAL_95, Array, record
+from mjfim.arrays import NORMAL_95, Array, finite_or_nan, record
 from mjfim.errors import first_ones, shortened
 from mjfim.records.base import Record, no_array
 from mjfim.records.design import CombinationAccuracy, LimitViolation
@@ -393,8 +393,8 @@ class Check(ParameterResult):
     def covariance(self) -> Array:
         """(t, t) predicted covariance of `wanted`; NaN where one is not identifiable alone."""
         std = np.array([row.std for row in self.rows if not row.nuisance])
-        std = np.where(np.isfinite(std), std, np.nan)
-        return np.asarray(self.correlation * np.outer(std, std))
+        std = finite_or_nan(std)
+        return self.correlation * np.outer(std, std)
 
     @property
     def is_dangerous(self) -> bool:

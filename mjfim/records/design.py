@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from mjfim.arrays import Array, record, scaled_pseudo_inverse
+from mjfim.arrays import Array, finite_or_nan, record, scaled_pseudo_inverse
 from mjfim.errors import MjfimError
 from mjfim.records.base import NamedEnum, Record, SavedRecord, ShownRecord, no_array
 from mjfim.records.rehearsal import Rehearsal, Valley
@@ -596,15 +596,15 @@ class Design(ParameterResult):
         """(N+1, p) standard deviations to state, by the measurements up to each sample."""
         std = self.final.std
         ratio = np.divide(self.stated_std, std, out=np.ones(len(std)), where=np.isfinite(std))
-        return np.asarray(self.final.std_over_time * ratio)
+        return self.final.std_over_time * ratio
 
     @property
     def covariance(self) -> Array:
         """(p, p) predicted covariance; NaN where a parameter is not identifiable alone."""
         inverse = scaled_pseudo_inverse(self.final.information, SMALLEST_EIGENVALUE)
         spread = np.sqrt(np.maximum(np.diag(inverse), np.finfo(float).tiny))
-        std = np.where(np.isfinite(self.stated_std), self.stated_std, np.nan) / spread
-        return np.asarray(inverse * np.outer(std, std))
+        std = finite_or_nan(self.stated_std) / spread
+        return inverse * np.outer(std, std)
 
     @property
     def shares(self) -> Array:

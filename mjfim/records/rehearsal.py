@@ -180,7 +180,7 @@ class Valley(Record):
     @property
     def percent(self) -> Array:
         """(2, p) differences from the nominal values [%]."""
-        return np.asarray(100.0 * (self.theta - self.nominal) / self.sizes)
+        return 100.0 * (self.theta - self.nominal) / self.sizes
 
     @property
     def moved(self) -> list[int]:

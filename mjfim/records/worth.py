@@ -42,6 +42,11 @@ class SensorWorth(Record):
     alone: Array
     halved: Array
 
+    @property
+    def improved(self) -> Array:
+        """(p,) standard deviations with half of the noise, or with a sensor that is added."""
+        return self.present if self.is_added else self.halved
+
 
 @record
 class Price(Record):

@@ -181,14 +181,14 @@ def test_a_design_that_was_written_is_read_back(tmp_path: Path) -> None:
     m, c = CART_PARAMETERS["m"], CART_PARAMETERS["c"]
     first = cart_task(tmp_path, parameters={"m": {**m, "prior": 0.1}, "c": c}, **tables)
     design = design_task(first)
-    archive.write_design(tmp_path / "one", design, first.system)
+    archive.write_data(tmp_path / "one", design, first.system)
     own = design.final.information - np.diag([100.0, 0.0])
     earlier = str(tmp_path / "one" / "design.json")
     turned = {"c": {**c, "prior": 2.0}, "m": m}
     second = cart_task(tmp_path, parameters=turned, earlier=(earlier,), **tables)
     assert_allclose(second.prior, own[::-1, ::-1] + np.diag([0.25, 0.0]), rtol=1e-9)
     again = design_task(second)
-    archive.write_design(tmp_path / "two", again, second.system)
+    archive.write_data(tmp_path / "two", again, second.system)
     files = [tmp_path / number / "design.json" for number in ("one", "two")]
     total = known_from(files, ("c", "m"))[0]
     assert_allclose(total, again.final.information - np.diag([0.25, 0.0]), rtol=1e-8)

@@ -242,7 +242,7 @@ def test_curves_are_chosen_by_joint_with_the_same_numbers_everywhere(tmp_path: P
     assert shown.index(("position", "slide")) < shown.index(("velocity", "slide"))
     page, numbers = page_of(found), found.summary()["fans"]
     (table,) = [
-        part for part in page.sections[0].parts if getattr(part, "columns", ())[:1] == ("quantity",)
+        part for part in page.every_part if getattr(part, "columns", ())[:1] == ("quantity",)
     ]
     for fan, row, told, panel in zip(
         found.fans, table.rows, numbers, fan_panels(found), strict=True

@@ -12,7 +12,7 @@ import numpy as np
 import mjfim
 from mjfim.errors import MjfimError
 from mjfim.experiment.system import System
-from mjfim.output.archive import write_design
+from mjfim.output.archive import write_data
 from mjfim.records.design import keeps_limits
 from tests.fuzz.bad_inputs import pick
 from tests.fuzz.mechanisms import random_mechanism
@@ -65,7 +65,7 @@ def run(case: Case, folder: Path) -> Outcome:
     if not keeps_limits(design):
         return Outcome(case=case, group="infeasible", description=description)
 
-    write_design(folder, design, System.resolve(experiment, threads=1))
+    write_data(folder, design, System.resolve(experiment, threads=1))
     found = [*violations(plant, tables, folder), *omissions(plant, design.warnings)]
     complaint = "; ".join(found)
     return Outcome(case=case, group="claimed", description=description, complaint=complaint)

@@ -55,7 +55,7 @@ def test_the_estimate_starts_from_the_equation_of_motion_and_is_saved_shown_and_
     first, second = loaded.residual_forces[0], estimate.residual_forces[0]
     assert_array_equal(first.force, second.force)
     assert loaded.summary()["inverse_dynamics"]["equations"][1]["name"] == "hinge"
-    assert "Residual torque" in [section.title for section in page_of(loaded).sections]
+    assert "Residual torque" in page_of(loaded).sections
     loaded.plot("residual_torque", file=tmp_path / "forces.png")
     assert (tmp_path / "forces.png").stat().st_size > 10_000
     assert "The equation of motion holds" in loaded.inverse_dynamics._repr_html_()

@@ -107,7 +107,7 @@ def test_picture_table_and_json_have_the_same_numbers(estimate: Estimate, tmp_pa
     estimate.save(tmp_path)
     summary = Estimate.load(tmp_path).summary()["information_in_time"]
     assert_array_equal(summary["seconds_of_most"], found.seconds_of_most)
-    parts = [part for section in page_of(estimate).sections for part in section.parts]
+    parts = list(page_of(estimate).every_part)
     table = next(p for p in parts if isinstance(p, Table) and p.title.startswith("Shortest time"))
     seconds = [f"{s:.2g} s" for s in found.seconds_of_most]
     assert [row.cells[1] for row in table.rows] == seconds == list(first.beside[0][2])

@@ -87,7 +87,7 @@ def test_joint_experiments_do_not_take_round_off_for_information(tmp_path) -> No
 def test_earlier_information_of_a_design_leaves_every_sigma_known(tmp_path) -> None:
     task = pendulum(tmp_path)
     design = design_task(task)
-    archive.write_design(tmp_path, design, task.system)
+    archive.write_data(tmp_path, design, task.system)
     again = DesignTask.resolve(task.experiment.replace(earlier=[str(tmp_path / "design.json")]))
     alone, told = (
         np.array([row.std for row in check_task(each, trajectory=design.trajectory).rows])

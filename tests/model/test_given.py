@@ -12,8 +12,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from mjfim.errors import ExperimentError, ModelError
-from mjfim.model.comparison import differences, same_dynamics
-from mjfim.model.given import packed
+from mjfim.model.given import differences, packed, same_dynamics
 from mjfim.model.loading import packed_model
 from tests.support.mesh_model import MESH, write_mesh_model
 from tests.support.paths import ROOT

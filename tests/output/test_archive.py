@@ -55,7 +55,7 @@ def design(task: DesignTask) -> Design:
 def folder(task: DesignTask, design: Design, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Folder with design.json, design.npz and design.csv of the design."""
     home = tmp_path_factory.mktemp("design") / "new" / "folder"
-    archive.write_design(home, design, task.system)
+    archive.write_data(home, design, task.system)
     return home
 
 
@@ -332,7 +332,7 @@ def half_written(*args: Any, **kwargs: Any) -> None:
 
 def write_all(folder: Path, design: Design, task: DesignTask) -> None:
     """Write a design, a picture and a view of it."""
-    archive.write_design(folder, replace(design, seconds=1.0), task.system)
+    archive.write_data(folder, replace(design, seconds=1.0), task.system)
     draw.save(Figure(), folder / "accuracy.png")
     log_design(folder / "design.rrd", task.system.model, design, design.labels)
 

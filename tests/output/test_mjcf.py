@@ -20,7 +20,7 @@ from mjfim.experiment.packing import with_model
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
 from mjfim.files import write_json
-from mjfim.model.comparison import same_dynamics
+from mjfim.model.given import same_dynamics
 from mjfim.model.paths import KINDS, fields_of
 from mjfim.output.archive import summary_with_origin
 from mjfim.output.export.mjcf import write_identified

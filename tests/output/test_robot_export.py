@@ -41,7 +41,7 @@ pytestmark = pytest.mark.slow
 @pytest.fixture(scope="module")
 def folder(cart: Designed, tmp_path_factory: pytest.TempPathFactory) -> Path:
     place = tmp_path_factory.mktemp("design")
-    archive.write_design(place, cart[1], System.resolve(cart[0]))
+    archive.write_data(place, cart[1], System.resolve(cart[0]))
     return place
 
 

@@ -80,7 +80,7 @@ def missing(numbers: list[str], text: str) -> list[str]:
 def test_a_design_and_its_check_state_the_same_accuracy(
     task: DesignTask, design: Design, check: Check, tmp_path: Path
 ) -> None:
-    archive.write_design(tmp_path, design, task.system)
+    archive.write_data(tmp_path, design, task.system)
     write_report(tmp_path)
     stored = json.loads((tmp_path / "design.json").read_text(encoding="utf-8"))
     std = stored["final"]["std"]

@@ -17,7 +17,7 @@ from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import simulate_system
 from mjfim.identification.fit_problem import FitProblem
-from mjfim.model.comparison import same_dynamics
+from mjfim.model.given import same_dynamics
 from mjfim.output.export.sysid import SysidProblem, silenced, sysid_problem
 from mjfim.records.trajectory import Recording
 from tests.support.dense_residuals import dense_residuals

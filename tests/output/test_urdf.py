@@ -13,7 +13,7 @@ from numpy.testing import assert_allclose
 
 import mjfim
 from mjfim.experiment.system import System
-from mjfim.model.comparison import same_dynamics
+from mjfim.model.given import same_dynamics
 from mjfim.model.model_files import urdf_sources
 from mjfim.output.export.mjcf import identified_files, write_identified
 from mjfim.output.manifest import MANIFEST

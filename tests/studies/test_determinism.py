@@ -12,7 +12,7 @@ import mjfim
 from mjfim.excitation.design import design_task
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
-from mjfim.output.archive import write_design
+from mjfim.output.archive import write_data
 from mjfim.records.events import Event
 from tests.support.contents import contents
 from tests.support.limits import ARM, cart_inside, floating_task
@@ -28,7 +28,7 @@ def study(experiment: Experiment, folder: Path, threads: int) -> dict[str, Any]:
     with threadpool_limits(threads, user_api="blas"):
         task = DesignTask.resolve(experiment, threads=threads)
         design = design_task(task)
-        write_design(folder, design, task.system)
+        write_data(folder, design, task.system)
 
         recording = mjfim.simulate(experiment, design.trajectory, seed=3, threads=threads)
         mjfim.identify(experiment, [recording], threads=threads).save(folder)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from rich.console import Console
 
-from mjfim.output.page import Page, Part, Section, Text
+from mjfim.output.page import Page, Part, Text
 from mjfim.output.terminal import TerminalPage
 from mjfim.records.verdict import Level, Verdict
 
@@ -25,4 +25,4 @@ def sentences(page: Page) -> str:
 def page_with(*parts: Part, verdict: str = "Done.") -> Page:
     """A page with these parts."""
     found = Verdict(verdict, Level.GOOD)
-    return Page(kind="Kind", verdict=found, sections=[Section("", parts)])
+    return Page(kind="Kind", verdict=found, sections={"": parts})

@@ -23,16 +23,16 @@ from mjfim.errors import ExperimentError, ModelError, OutputError, first_ones, l
 from mjfim.experiment.packing import input_files
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
-from mjfim.model.comparison import (
+from mjfim.model.control_laws import remove_numbers
+from mjfim.model.elements import element_count, element_name
+from mjfim.model.given import (
     ROUNDING,
     TOLERANCE,
     differ_in_inertia,
     differences,
+    exact_numbers,
     same_inertias,
 )
-from mjfim.model.control_laws import remove_numbers
-from mjfim.model.elements import element_count, element_name
-from mjfim.model.given import exact_numbers
 from mjfim.model.loading import ModelSource, compile_spec, refused
 from mjfim.model.model_files import changed_files, elements_of
 from mjfim.model.parameters import ParameterSet
@@ -558,7 +558,7 @@ def _state_others(xml: ModelXml, parameters: ParameterSet, theta: Array) -> bool
         for target in parameter.targets:
             field, number = target.field, target.scale * float(value) + target.offset
             if isinstance(field, SpecField) and field.field in ("mass", "density"):
-                xml.named(field.kind, field.name).set(field.field, all_digits(number))
+                xml.named("geom", field.name).set(field.field, all_digits(number))
                 has_masses = True
             elif isinstance(field, OF_SENSORS) and number != 0.0:
                 unit = parameter.unit if target.scale == 1.0 else ""

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from mjfim.arrays import Array
 from mjfim.errors import ModelError
 from mjfim.files import replacing
-from mjfim.model.comparison import ROUNDING
+from mjfim.model.given import ROUNDING
 from mjfim.model.loading import refused
 from mjfim.model.model_files import included_file
 

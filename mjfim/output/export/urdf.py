@@ -15,8 +15,8 @@ import numpy as np
 from mjfim.arrays import Array
 from mjfim.errors import ModelError, first_ones
 from mjfim.experiment.system import System
-from mjfim.model.comparison import ROUNDING, same_inertia
 from mjfim.model.elements import identifier
+from mjfim.model.given import ROUNDING, same_inertia
 from mjfim.model.inertia import (
     INERTIA_COLUMNS,
     INERTIA_ENTRIES,

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from mjfim.arrays import NORMAL_95, POORLY_KNOWN_SHARE, UNDETERMINED_SHARE, Array
+from mjfim.arrays import NORMAL_95, POORLY_KNOWN_SHARE, UNDETERMINED_SHARE, Array, finite_or_nan
 from mjfim.errors import first_ones, listed
 from mjfim.output.page import (
     Emphasis,
@@ -16,7 +16,6 @@ from mjfim.output.page import (
     Part,
     Plot,
     Row,
-    Section,
     Table,
     Text,
     as_sentence,
@@ -24,6 +23,7 @@ from mjfim.output.page import (
     named,
     number,
     numbers,
+    parameter_names,
     tabulated,
     warned,
 )
@@ -80,22 +80,9 @@ def design_page(design: Design) -> Page:
     search: list[Part] = [_eigenvalue_table(design), Plot("convergence", detail=True)]
     if len(design.starts) > 1:
         search.append(_start_table(design))
-    sections = [
-        Section("Accuracy", list(_accuracy_parts(design))),
-        Section("Motion", [Plot("trajectories")]),
-        Section("Optimisation", search),
-    ]
-    if design.limits:
-        margins = numbers(design.limits.values())
-        columns = {"limit": [*design.limits], "worst margin (negative: violated)": margins}
-        table = tabulated("Limits", columns, detail=design.rehearsal is not None)
-        sections.insert(2, Section("Limits", [Plot("limits"), table]))
-    if design.rehearsal is not None:
-        sections.insert(1, Section("Rehearsal", list(_rehearsal_parts(design.rehearsal))))
-    if design.valley is not None:
-        sections.insert(1, Section("Two robots", _valley_parts(design.valley)))
-    if design.worth is not None:
-        sections.append(Section("What would help", worth_parts(design.worth, detail=True)))
+    margins = numbers(design.limits.values())
+    columns = {"limit": [*design.limits], "worst margin (negative: violated)": margins}
+    limits = tabulated("Limits", columns, detail=design.rehearsal is not None)
     before, after = _least_eigenvalues(design)
     reserve = listed([f"{100 * share:.2g} % of {kind}" for kind, share in design.reserve.items()])
     return Page(
@@ -110,7 +97,15 @@ def design_page(design: Design) -> Page:
             "time of the search": f"{design.seconds:.3g} s",
             **({"reserve": reserve} if reserve else {}),
         },
-        sections=sections,
+        sections={
+            "Accuracy": _accuracy_parts(design),
+            "Two robots": _valley_parts(design.valley),
+            "Rehearsal": _rehearsal_parts(design.rehearsal),
+            "Motion": [Plot("trajectories")],
+            "Limits": [Plot("limits"), limits] if design.limits else (),
+            "Optimisation": search,
+            "What would help": worth_parts(design.worth, detail=True),
+        },
     )
 
 
@@ -193,7 +188,7 @@ def _faults(rehearsal: Rehearsal) -> Iterator[str]:
     if rehearsal.passes_floor.any():
         passing, deepest = _that(rehearsal.below_floor, "pass"), -np.nanmin(rehearsal.lowest)
         yield f"{passing} through {_floor(rehearsal)}, by up to {deepest:.3g} m"
-    worst = np.where(np.isfinite(rehearsal.margins), rehearsal.margins, np.nan)
+    worst = finite_or_nan(rehearsal.margins)
     broken = np.flatnonzero(~rehearsal.kept.all(axis=0))
     order = np.lexsort((rehearsal.kept[:, broken].sum(axis=0), rehearsal.is_clamped[broken]))
     for i in broken[order].tolist():
@@ -458,11 +453,13 @@ def rehearsal_page(rehearsal: Rehearsal) -> Page:
             "error of the parameters": f"{100.0 * rehearsal.wrong:g} %",
             "control": control,
         },
-        sections=[Section("Rehearsal", list(_rehearsal_parts(rehearsal)))],
+        sections={"Rehearsal": _rehearsal_parts(rehearsal)},
     )
 
 
-def _rehearsal_parts(rehearsal: Rehearsal, *, is_detail: bool = False) -> Iterator[Part]:
+def _rehearsal_parts(rehearsal: Rehearsal | None, *, is_detail: bool = False) -> Iterator[Part]:
+    if rehearsal is None:
+        return
     yield Plot("rehearsal")
     if rehearsal.limits:
         yield replace(_margin_table(rehearsal), detail=is_detail)
@@ -496,13 +493,15 @@ def _rehearsal_parts(rehearsal: Rehearsal, *, is_detail: bool = False) -> Iterat
     yield Text(_surroundings(rehearsal), detail=is_detail or not is_assumed)
 
 
-def _valley_parts(valley: Valley) -> Sequence[Part]:
+def _valley_parts(valley: Valley | None) -> Sequence[Part]:
     """Say which two robots a motion does not tell apart, and tabulate their parameters."""
+    if valley is None:
+        return ()
     moved = valley.moved
     table = tabulated(
         "Two robots that move alike",
         {
-            "parameter": [named(valley.parameters[j], valley.units[j]) for j in moved],
+            "parameter": parameter_names(valley, moved),
             "robot 1": numbers(valley.theta[0, moved], 4),
             "robot 2": numbers(valley.theta[1, moved], 4),
             "difference": numbers(np.diff(valley.percent, axis=0)[0, moved], 3, " %"),
@@ -527,7 +526,7 @@ def _surroundings(rehearsal: Rehearsal) -> str:
 
 def _margin_table(rehearsal: Rehearsal) -> Table:
     """Tabulate the limits, the least kept first."""
-    worst = np.where(np.isfinite(rehearsal.margins), rehearsal.margins, np.nan)
+    worst = finite_or_nan(rehearsal.margins)
     least = np.nanmin(worst, axis=0)
     order = np.argsort(least, kind="stable").tolist()
     limits = [rehearsal.limits[i] for i in order]
@@ -674,20 +673,10 @@ def _start_table(design: Design) -> Table:
 
 def check_page(check: Check) -> Page:
     """Describe predicted standard deviations, and inseparable parameters."""
-    sections = [Section("Accuracy", list(_check_parts(check)))]
-    if check.rehearsal is not None:
-        # Nobody plays a start; its margins matter where it is dangerous.
-        is_detail = check.is_start and not check.is_dangerous
-        parts = list(_rehearsal_parts(check.rehearsal, is_detail=is_detail))
-        sections.append(Section("Rehearsal", parts))
-    if check.valley is not None:
-        sections.append(Section("Two robots", _valley_parts(check.valley)))
-    if check.worth is not None:
-        sections.append(Section("What would help", worth_parts(check.worth, detail=True)))
-    if check.violations:
-        title = "The motion of the initial control violates limits; a design looks for one inside:"
-        items = tuple(str(violation) for violation in check.violations)
-        sections.append(Section("Limits", [Listing(title, items, detail=True)]))
+    title = "The motion of the initial control violates limits; a design looks for one inside:"
+    broken = Listing(title, tuple(map(str, check.violations)), detail=True)
+    # Nobody plays a start; its margins matter where it is dangerous.
+    is_detail = check.is_start and not check.is_dangerous
     return Page(
         kind="Check of an experiment",
         verdict=_check_verdict(check),
@@ -699,7 +688,13 @@ def check_page(check: Check) -> Page:
             "parameters": str(len(check.rows)),
             "condition of the information": number(check.condition),
         },
-        sections=sections,
+        sections={
+            "Accuracy": _check_parts(check),
+            "Rehearsal": _rehearsal_parts(check.rehearsal, is_detail=is_detail),
+            "Two robots": _valley_parts(check.valley),
+            "What would help": worth_parts(check.worth, detail=True),
+            "Limits": [broken] if check.violations else (),
+        },
     )
 
 
@@ -862,5 +857,5 @@ def designs_page(comparison: DesignComparison) -> Page:
     return Page(
         kind="Comparison of two designs",
         verdict=Verdict(text, Level.DOUBTFUL if worse else Level.GOOD, ok=not worse),
-        sections=[Section("Accuracy", [table, Text(costs), Text(BEST_CASE, Emphasis.WEAK)])],
+        sections={"Accuracy": [table, Text(costs), Text(BEST_CASE, Emphasis.WEAK)]},
     )

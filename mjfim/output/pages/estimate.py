@@ -9,7 +9,7 @@ from itertools import chain
 
 import numpy as np
 
-from mjfim.arrays import NORMAL_95, POORLY_KNOWN_SHARE, UNDETERMINED_SHARE
+from mjfim.arrays import NORMAL_95, POORLY_KNOWN_SHARE, UNDETERMINED_SHARE, finite_or_nan
 from mjfim.errors import first_ones, listed
 from mjfim.identification.assessment.residual_tests import is_larger_than_noise
 from mjfim.output.page import (
@@ -21,13 +21,12 @@ from mjfim.output.page import (
     Part,
     Plot,
     Row,
-    Section,
     Table,
     Text,
     capitalised,
-    named,
     number,
     numbers,
+    parameter_names,
     tabulated,
     warned,
 )
@@ -94,7 +93,7 @@ def estimate_page(estimate: Estimate) -> Page:
             "iterations": str(estimate.iterations),
             "time of the fit": f"{estimate.seconds:.3g} s",
         },
-        sections=[Section(title, found) for title, found in parts.items() if found],
+        sections=parts,
     )
 
 
@@ -236,7 +235,7 @@ def _estimate_table(estimate: Estimate) -> Table:
     ]
     at_bound = [name in estimate.at_bound for name in names]
     columns = {
-        "parameter": list(map(named, names, estimate.units)),
+        "parameter": parameter_names(estimate),
         NOMINAL: numbers(estimate.initial_theta, 4),
         IDENTIFIED: list(map(_as_accurate, estimate.theta, std)),
         "formal σ": formal,
@@ -491,7 +490,7 @@ def recording_parts(estimate: Estimate) -> Sequence[Part]:
 def _scatter_table(comparison: RecordingComparison) -> Table:
     """Tabulate means over the recordings, and the scatter between them."""
     low, high = comparison.interval.T
-    new = np.where(np.isfinite(comparison.prediction), comparison.prediction, np.nan).T
+    new = finite_or_nan(comparison.prediction).T
     p = [
         "stated" if is_stated else p_text(p).removeprefix("p = ")
         for is_stated, p in zip(comparison.is_stated, comparison.p, strict=True)
@@ -499,7 +498,7 @@ def _scatter_table(comparison: RecordingComparison) -> Table:
     return tabulated(
         "Means over the recordings, and another recording",
         {
-            "parameter": list(map(named, comparison.parameters, comparison.units)),
+            "parameter": parameter_names(comparison),
             "mean": numbers(comparison.mean, 4),
             "95 % low": numbers(low, 4),
             "high": numbers(high, 4),
@@ -535,7 +534,7 @@ def _value_table(comparison: RecordingComparison) -> Table:
             "recording": [
                 comparison.recordings[k] + (" (odd)" if k in odd else "") for _, k in pairs
             ],
-            "parameter": [named(comparison.parameters[j], comparison.units[j]) for j, _ in pairs],
+            "parameter": parameter_names(comparison, (j for j, _ in pairs)),
             "value": numbers([comparison.values[k, j] for j, k in pairs], 4),
             "σ": numbers([comparison.std[k, j] for j, k in pairs], 2, infinite="-"),
         },
@@ -558,7 +557,7 @@ def sample_parts(estimate: Estimate) -> Iterator[Part]:
     yield tabulated(
         "Parameters of the drawn robots",
         {
-            "parameter": list(map(named, draws.parameters, draws.units)),
+            "parameter": parameter_names(draws),
             "centre": numbers(draws.centre, 4),
             "σ": numbers(draws.std, 2),
             "smallest": numbers(low, 4),

@@ -13,7 +13,6 @@ from mjfim.output.page import (
     Page,
     Part,
     Row,
-    Section,
     Table,
     named,
     number,
@@ -38,8 +37,7 @@ def _table(title: str, headings: str, rows: Sequence[tuple[str, ...]]) -> Table:
 def _page(kind: str, verdict: str, tables: Sequence[Table], further: Sequence[Part] = ()) -> Page:
     """A page of the tables that have rows."""
     parts = [*(table for table in tables if table.rows), *further]
-    sections = [Section("", parts)]
-    return Page(kind=kind, verdict=Verdict(verdict, Level.GOOD, ok=True), sections=sections)
+    return Page(kind=kind, verdict=Verdict(verdict, Level.GOOD, ok=True), sections={"": parts})
 
 
 # ---- model
@@ -163,7 +161,7 @@ def _serves(stated: StatedExperiment) -> str:
 # ---- logs
 
 
-def log_section(logs: Sequence[LogSummary]) -> Section:
+def log_tables(logs: Sequence[LogSummary]) -> Sequence[Table]:
     """Describe what was read: the clock of every log, then the range of its columns."""
     clocks = [
         (
@@ -182,20 +180,15 @@ def log_section(logs: Sequence[LogSummary]) -> Section:
     for log in logs:
         for column in log.columns:
             by_name.setdefault(column.name, []).append(column)
-    return Section(
-        "Logs",
-        [
-            _table(
-                "Logs that were read",
-                "log, rows, time, rate, jitter, longest gap, rejected",
-                clocks,
-            ),
-            _table(
-                "Range of each column over all logs",
-                "column, from, smallest, largest, resolution, empty",
-                [_range_cells(found) for found in by_name.values()],
-            ),
-        ],
+    return (
+        _table(
+            "Logs that were read", "log, rows, time, rate, jitter, longest gap, rejected", clocks
+        ),
+        _table(
+            "Range of each column over all logs",
+            "column, from, smallest, largest, resolution, empty",
+            [_range_cells(found) for found in by_name.values()],
+        ),
     )
 
 

@@ -18,7 +18,6 @@ from mjfim.output.page import (
     Part,
     Plot,
     Row,
-    Section,
     Table,
     Text,
     as_sentence,
@@ -26,6 +25,7 @@ from mjfim.output.page import (
     named,
     number,
     numbers,
+    parameter_names,
     shown_word,
     tabulated,
     warned,
@@ -74,12 +74,13 @@ def campaign_page(campaign: Campaign, true: Array | None = None) -> Page:
         campaign: The campaign.
         true: (p,) true values of its parameters [theta-unit], where they are known.
     """
-    facts, sections = {"rounds": str(len(campaign.rounds))}, []
+    facts: dict[str, str] = {"rounds": str(len(campaign.rounds))}
+    sections: dict[str, Sequence[Part]] = {}
     if campaign.rounds:
-        sections = [
-            Section("Parameters", [_campaign_table(campaign, true)]),
-            Section("Rounds", [Plot("campaign")]),
-        ]
+        sections = {
+            "Parameters": [_campaign_table(campaign, true)],
+            "Rounds": [Plot("campaign")],
+        }
         last = campaign.rounds[-1].estimate
         facts["recordings"] = str(len(last.recordings))
         facts["χ²/dof of the last fit"] = f"{last.chi2 / max(last.dof, 1):.3f}"
@@ -102,7 +103,7 @@ def _campaign_table(campaign: Campaign, true: Array | None) -> Table:
     estimate, chosen = campaign.rounds[-1].estimate, campaign.interest
     values, std, wanted = estimate.theta[chosen], estimate.std[chosen], campaign.wanted[chosen]
     columns = {
-        "parameter": [named(estimate.parameters[j], estimate.units[j]) for j in chosen],
+        "parameter": parameter_names(estimate, chosen),
         NOMINAL: numbers(campaign.rounds[0].theta[chosen], 5),
         IDENTIFIED: numbers(values, 5),
         "formal σ": numbers(std, 2),
@@ -144,7 +145,7 @@ def robots_page(comparison: RobotComparison) -> Page:
             "compared parameters": str(len(comparison.parameters)),
             "all parameters together": p_text(comparison.joint_p),
         },
-        sections=[Section("Differences", parts)],
+        sections={"Differences": parts},
     )
 
 
@@ -181,7 +182,7 @@ def _robot_table(comparison: RobotComparison) -> Table:
     return tabulated(
         "Parameters of both robots",
         {
-            "parameter": [named(comparison.parameters[j], comparison.units[j]) for j in order],
+            "parameter": parameter_names(comparison, order),
             **robots,
             "difference": numbers(comparison.difference[order]),
             "95 % low": numbers(low),
@@ -245,7 +246,7 @@ def comparison_page(comparison: Comparison) -> Page:
             "budget of each": budget_in_words(comparison),
             "seed": str(comparison.seed),
         },
-        sections=[Section("Methods", parts)],
+        sections={"Methods": parts},
     )
 
 
@@ -306,7 +307,7 @@ def _method_row(comparison: Comparison, row: MethodResult) -> Row:
 
 def _std_table(comparison: Comparison) -> Table:
     wanted = list(comparison.wanted)
-    names = [named(comparison.parameters[j], comparison.units[j]) for j in wanted]
+    names = parameter_names(comparison, wanted)
     std = {row.title: numbers(row.std[wanted]) for row in comparison.rows}
     return tabulated("σ of each parameter", {"parameter": names, **std}, detail=True)
 
@@ -316,10 +317,7 @@ def _std_table(comparison: Comparison) -> Table:
 
 def study_page(study: MonteCarloStudy) -> Page:
     """Describe the observed scatter of estimates beside the Cramér-Rao bound."""
-    names = [
-        named(name, unit)
-        for name, unit in zip(study.parameters, study.labels.parameter_units, strict=True)
-    ]
+    names = list(map(named, study.parameters, study.labels.parameter_units))
     ranges = [
         f"{min(trials.efficiency):.2f} to {max(trials.efficiency):.2f} in {trials.trials:,} trials "
         f"along the {shown_word(name)} trajectory"
@@ -341,19 +339,16 @@ def study_page(study: MonteCarloStudy) -> Page:
             **{f"trials, {shown_word(name)}": str(t.trials) for name, t in study.sets.items()},
             "rate of the measurements": f"{study.measure_rate:g} Hz",
         },
-        sections=[
-            Section(
-                "Efficiency",
-                [
-                    Text(f"Efficiency of the estimates: {', and '.join(ranges)} (1 is the best)"),
-                    *(_efficiency_table(study, name, names) for name in study.sets),
-                    Plot("overview"),
-                    Text(legend, Emphasis.WEAK),
-                ],
-            ),
-            Section("Estimates", [Plot("histogram")]),
-            Section("Covariance", _covariance_tables(study, names)),
-        ],
+        sections={
+            "Efficiency": [
+                Text(f"Efficiency of the estimates: {', and '.join(ranges)} (1 is the best)"),
+                *(_efficiency_table(study, name, names) for name in study.sets),
+                Plot("overview"),
+                Text(legend, Emphasis.WEAK),
+            ],
+            "Estimates": [Plot("histogram")],
+            "Covariance": _covariance_tables(study, names),
+        },
     )
 
 
@@ -459,7 +454,7 @@ def equation_page(fit: InverseDynamicsFit) -> Page:
     table = tabulated(
         "Parameters",
         {
-            "parameter": list(map(named, fit.parameters, fit.units)),
+            "parameter": parameter_names(fit),
             "start": numbers(fit.start, 4),
             "estimate": numbers(fit.theta, 5),
             "formal σ": std,
@@ -469,10 +464,10 @@ def equation_page(fit: InverseDynamicsFit) -> Page:
         kind="Parameters fitted to the equation of motion",
         verdict=verdict,
         next_steps=steps,
-        sections=[
-            Section("Parameters", [Text(capitalised(fit.status)), table]),
-            Section("Equation of motion", list(equation_parts(fit))),
-        ],
+        sections={
+            "Parameters": [Text(capitalised(fit.status)), table],
+            "Equation of motion": equation_parts(fit),
+        },
     )
 
 
@@ -558,7 +553,7 @@ def watch_page(watch: Watch) -> Page:
     order = np.argsort(np.isfinite(watch.reached), kind="stable")
     std, wanted, reached = watch.std[order], watch.wanted[order], watch.reached[order]
     columns = {
-        "parameter": [named(watch.parameters[j], watch.units[j]) for j in order.tolist()],
+        "parameter": parameter_names(watch, order),
         "σ now": numbers(std, infinite=NOT_ALONE),
         "of the value": list(map(relative, std.tolist(), watch.sizes[order].tolist())),
         "wanted": numbers(wanted, infinite=""),
@@ -579,7 +574,7 @@ def watch_page(watch: Watch) -> Page:
         ),
         warnings=watch.warnings,
         facts={"rows": str(watch.rows), "duration": f"{watch.seconds:.1f} s"},
-        sections=[Section("Accuracy so far", [table, Plot("watch")])],
+        sections={"Accuracy so far": [table, Plot("watch")]},
     )
 
 

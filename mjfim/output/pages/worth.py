@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
@@ -12,7 +12,6 @@ from mjfim.output.page import (
     Page,
     Part,
     Plot,
-    Section,
     Table,
     Text,
     capitalised,
@@ -23,7 +22,7 @@ from mjfim.output.page import (
 )
 from mjfim.output.words import NOT_ALONE, improvement
 from mjfim.records.verdict import Level, Verdict
-from mjfim.records.worth import Price, SensorWorth, Worth
+from mjfim.records.worth import Price, Worth
 
 # Increase of σ up to which a sensor is hardly needed, and from which its row is marked (factors).
 SMALL_INCREASE, LARGE_INCREASE = 1.05, 2.0
@@ -42,7 +41,7 @@ def worth_page(worth: Worth) -> Page:
         verdict=Verdict(headline(worth), Level.GOOD, ok=True),
         next_steps=tuple(steps),
         facts={"motion": worth.source, "duration": f"{worth.horizon:g} s"},
-        sections=[Section("What would help", worth_parts(worth))],
+        sections={"What would help": worth_parts(worth)},
     )
 
 
@@ -57,9 +56,9 @@ def headline(worth: Worth) -> str:
     for added in (False, True):
         rows = [each for each in worth.single if each.is_added == added]
         if rows:
-            best = min(rows, key=lambda each: worth.ratio(_improved(each)))
+            best = min(rows, key=lambda each: worth.ratio(each.improved))
             what = best.name if added else f"half the noise of {best.name}"
-            helps.append(f"{what} ({change(worth, _improved(best)).partition(' (')[0]})")
+            helps.append(f"{what} ({change(worth, best.improved).partition(' (')[0]})")
     if worth.prices:
         price = worth.dearest[0]
         helps.append(f"{price_name(price)} ({percent(price.change)})")
@@ -67,18 +66,15 @@ def headline(worth: Worth) -> str:
     return f"{capitalised(worth.source)} {reached}. What lowers σ: {', '.join(helps)}."
 
 
-def _improved(sensor: SensorWorth) -> Array:
-    """(p,) standard deviations with half of the noise, or with a sensor that is added."""
-    return sensor.present if sensor.is_added else sensor.halved
-
-
-def worth_parts(worth: Worth, *, detail: bool = False) -> list[Part]:
+def worth_parts(worth: Worth | None, *, detail: bool = False) -> Sequence[Part]:
     """Return the picture, the tables and the sentences of what would help.
 
     Args:
-        worth: The record.
+        worth: The record; None for none.
         detail: Whether a short form leaves the tables out.
     """
+    if worth is None:
+        return ()
     present = [each for each in worth.sensors if not each.is_added]
     added = [each for each in worth.sensors if each.is_added]
     added.sort(key=lambda each: worth.ratio(each.present))

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mjfim.arrays import Array
+from mjfim.arrays import Array, finite_or_nan
 from mjfim.output.page import number
 from mjfim.output.panels import Axis, Panel, around, dots, hline, line, row_axis
 from mjfim.output.words import relative, shorten
@@ -54,7 +54,7 @@ def accuracy_panel(
     """
     rows = np.arange(len(names), dtype=np.float64)
     percent = 100.0 * np.array([source.std for source in sources]) / sizes
-    goal = 100.0 * np.where(np.isfinite(wanted), wanted, np.nan) / sizes
+    goal = 100.0 * finite_or_nan(wanted) / sizes
     low, high = around(np.concatenate([percent.ravel(), goal]), factor=1.6)
 
     marks = []
@@ -110,7 +110,7 @@ def accuracy_over_time_panel(
     """
     shares = sizes / 100.0
     ends = (np.stack([std[-1] for _, std in motions]) / shares)[:, shown]
-    goals = np.where(np.isfinite(targets), targets, np.nan)[shown] / shares[shown]
+    goals = finite_or_nan(targets)[shown] / shares[shown]
     _, high = around(np.concatenate([ends.ravel(), LARGEST_OVER_TARGET * goals]), factor=1.5)
     low, _ = around(np.concatenate([ends.ravel(), goals]), factor=1.5)
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from mjfim.arrays import Array
+from mjfim.arrays import Array, finite_or_nan
 from mjfim.model.coordinates import split_unit
 from mjfim.model.units import FORCE_UNITS, LENGTH, per_second
 from mjfim.output.archive import shown_positions
@@ -169,15 +169,20 @@ def both_motions(design: Design) -> dict[str, Trajectory]:
 
 
 def motion_panels(
-    labels: Labels, trajectories: Mapping[str, Trajectory], usage: Sequence[LimitUsage] = ()
+    labels: Labels,
+    trajectories: Mapping[str, Trajectory],
+    usage: Sequence[LimitUsage] = (),
+    roles: Mapping[str, str] | None = None,
 ) -> dict[str, list[Panel]]:
     """Return panels of positions, velocities and controls of one or more trajectories.
 
     Args:
         labels: Names and units of all columns.
-        trajectories: The trajectories by their role.
+        trajectories: The trajectories by their name.
         usage: Limits, which are lines where the motion comes near them.
+        roles: Roles of the trajectories by their name; default: the name.
     """
+    roles = roles or {name: name for name in trajectories}
     shown = list(trajectories.values())
     positions, qpos = shown_positions(labels, *(each.qpos for each in shown))
     velocities = [label.replace(" velocity [", " [") for label in labels.velocities]
@@ -194,8 +199,8 @@ def motion_panels(
         for k, name in enumerate(names):
             columns = [each[:, k] for each in values]
             curves = [
-                _curve(trajectory.t, y, role, width)
-                for (role, trajectory), y, width in zip(
+                _curve(trajectory.t, y, roles[key], width, key)
+                for (key, trajectory), y, width in zip(
                     trajectories.items(), columns, (*LINE_WIDTHS, *[1.3] * len(shown)), strict=False
                 )
             ]
@@ -212,10 +217,10 @@ def motion_panels(
     return panels
 
 
-def _curve(t: Array, y: Array, role: str, width: float) -> Mark:
+def _curve(t: Array, y: Array, role: str, width: float, label: str) -> Mark:
     """Return a curve over time; a control is held from each time to the next."""
     kind: Kind = "line" if len(y) == len(t) else "steps"
-    return mark(kind, t, y, role, width=width, label=role)
+    return mark(kind, t, y, role, width=width, label=label)
 
 
 def _near_limits(limits: Sequence[float], values: Sequence[Array]) -> list[Mark]:
@@ -309,7 +314,7 @@ def accuracy(design: Design, labels: Labels) -> Picture:
 
     title, shares = "Predicted accuracy of one experiment", after / sizes
     if np.isfinite(shares).any():
-        worst = int(np.nanargmax(np.where(np.isfinite(shares), shares, np.nan)))
+        worst = int(np.nanargmax(finite_or_nan(shares)))
         title += f": σ is at most {relative(after[worst], sizes[worst])} ({names[worst]})"
     note = sigma_remark(design.inflation, design.parameters)
     if not np.array_equal(np.abs(design.theta), design.sizes):
@@ -545,7 +550,7 @@ def worth(result: Worth) -> Picture:
 
 def _reach(result: Worth, sensor: SensorWorth) -> float:
     """Ratio of the largest and the smallest σ that a sensor makes a difference for."""
-    least = result.ratio(sensor.present if sensor.is_added else sensor.halved)
+    least = result.ratio(sensor.improved)
     return 1.0 if np.isinf(least) else result.ratio(sensor.without) / least
 
 
@@ -556,11 +561,11 @@ def _sensors(result: Worth, rows: list[SensorWorth]) -> Panel:
     def ratios(stds: list[Array]) -> Array:
         """Largest ratio for each row; NaN where it is infinite."""
         found = np.array([result.ratio(std) for std in stds])
-        return np.where(np.isfinite(found), found, np.nan)
+        return finite_or_nan(found)
 
     is_added = np.array([each.is_added for each in rows])
     without = ratios([each.without for each in rows])
-    better = ratios([each.present if each.is_added else each.halved for each in rows])
+    better = ratios([each.improved for each in rows])
     alone = ratios([each.alone for each in rows])
     places = np.arange(len(rows))
     low, high = around(np.concatenate([without, better, [1.0, now]]), factor=2.0)

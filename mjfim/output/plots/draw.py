@@ -139,10 +139,9 @@ def figure_of(picture: Picture) -> Figure:
         room = WIDTH - max(names, default=0.0)
         for panel in picture.panels:
             row, column = panel.place
-            rows = slice(None) if panel.is_tall else row
             across = slice(None) if panel.is_wide else column
             share = 1.0 if panel.is_wide else picture.widths[column] / sum(picture.widths)
-            axes = figure.add_subplot(grid[rows, across])
+            axes = figure.add_subplot(grid[row, across])
             _draw_panel(axes, panel, room * share - PANEL_FRAME, picture.heights[row])
 
         # Empty lines of the title keep room for the legend.

@@ -10,7 +10,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from mjfim.arrays import NORMAL_95, Array, evenly_spread_indices
+from mjfim.arrays import NORMAL_95, Array, evenly_spread_indices, finite_or_nan
 from mjfim.errors import first_ones
 from mjfim.model.coordinates import split_unit
 from mjfim.output.page import DESIGNED, IDENTIFIED, MEASURED, NOMINAL, capitalised
@@ -123,7 +123,7 @@ def parameter_intervals(estimate: Estimate, labels: Labels) -> Picture:
     guess = estimate.initial_theta
     percent = np.where(estimate.guess_sizes > 0.0, estimate.guess_sizes, np.nan) / 100.0
     centre = (estimate.theta - guess) / percent
-    half = NORMAL_95 * np.where(np.isfinite(estimate.std), estimate.std, np.nan) / percent
+    half = NORMAL_95 * finite_or_nan(estimate.std) / percent
     low, high = ((end - guess) / percent for end in estimate.interval.T)
 
     left, right = range_of_intervals(centre, low, high)

@@ -11,7 +11,7 @@ from __future__ import annotations
 import logging
 import os
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from functools import partial, singledispatch
@@ -196,13 +196,19 @@ def _(design: Design) -> Pictures:
     }
     if design.usage:
         pictures["limits"] = partial(of_design.limits, design, labels)
-    if design.rehearsal is not None:
-        pictures["rehearsal"] = partial(studies.rehearsal, design.rehearsal)
-    if design.valley is not None:
-        motions = [(f"{term} motion", term) for term in (INITIAL, DESIGNED)]
-        pictures["valley"] = partial(studies.valley, design.valley, motions)
-    if design.worth is not None:
-        pictures["worth"] = partial(of_design.worth, design.worth)
+    motions = [(f"{term} motion", term) for term in (INITIAL, DESIGNED)]
+    return pictures | _of_motions(design, motions)
+
+
+def _of_motions(record: Design | Check, motions: Sequence[tuple[str, str]]) -> Pictures:
+    """What motions do to robots, do not determine, and would gain; names and roles of motions."""
+    pictures: Pictures = {}
+    if record.rehearsal is not None:
+        pictures["rehearsal"] = partial(studies.rehearsal, record.rehearsal)
+    if record.valley is not None:
+        pictures["valley"] = partial(studies.valley, record.valley, motions)
+    if record.worth is not None:
+        pictures["worth"] = partial(of_design.worth, record.worth)
     return pictures
 
 
@@ -277,15 +283,8 @@ def _(study: MonteCarloStudy) -> Pictures:
 
 @pictures_of.register
 def _(check: Check) -> Pictures:
-    pictures: Pictures = {"check": partial(studies.check, check)}
-    if check.rehearsal is not None:
-        pictures["rehearsal"] = partial(studies.rehearsal, check.rehearsal)
-    if check.valley is not None:
-        motion = check.source, studies.source_role(check)
-        pictures["valley"] = partial(studies.valley, check.valley, [motion])
-    if check.worth is not None:
-        pictures["worth"] = partial(of_design.worth, check.worth)
-    return pictures
+    motion = check.source, studies.source_role(check)
+    return {"check": partial(studies.check, check), **_of_motions(check, [motion])}
 
 
 @pictures_of.register

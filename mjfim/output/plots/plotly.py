@@ -112,8 +112,7 @@ def group_of(picture: Picture, limit: int) -> Group:
     plots = []
     for panel in picture.panels:
         label = panel.x.label or shared.get(panel.place[1], "")
-        rows = picture.heights if panel.is_tall else [picture.heights[panel.place[0]]]
-        height = max(int(INCH * sum(rows)), LEAST_HEIGHT)
+        height = max(int(INCH * picture.heights[panel.place[0]]), LEAST_HEIGHT)
         linked = "" if panel.x.names is not None or panel.cells else f"{picture.title} {label}"
         plots.append(
             Plot(

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from mjfim.arrays import NORMAL_95, Array
+from mjfim.arrays import NORMAL_95, Array, finite_or_nan
 from mjfim.output.page import (
     DESIGNED,
     IDENTIFIED,
@@ -19,6 +19,7 @@ from mjfim.output.page import (
     OTHER,
     TRAJECTORY_TERMS,
     as_sentence,
+    parameter_names,
     shown_word,
 )
 from mjfim.output.pages.studies import budget_in_words, progress_of_watch
@@ -241,7 +242,7 @@ def valley(found: Valley, motions: Sequence[tuple[str, str]]) -> Picture:
         Panel(
             marks=marks,
             x=Axis(label="difference from the nominal value [% of its size]"),
-            y=row_axis([with_unit(found.parameters[j], found.units[j]) for j in moved]),
+            y=row_axis(parameter_names(found, moved, with_unit)),
             beside=beside,
             place=(2, 0),
             is_wide=True,
@@ -350,7 +351,7 @@ def _ratios(
     if design is not None and against_design:
         reference, title = design.std[wanted], "σ of each parameter / σ of the design"
     ratios = std / reference
-    logarithms = np.log(np.where(np.isfinite(ratios), ratios, np.nan))
+    logarithms = np.log(finite_or_nan(ratios))
     if np.isnan(logarithms).all():
         return Panel(message="no parameter is identifiable alone", y=methods)
 
@@ -441,7 +442,7 @@ def overview(study: MonteCarloStudy, labels: Labels) -> Picture:
         rows = np.arange(len(shown)) + shift
         observed = np.sqrt(np.diagonal(trials.covariance)[shown]) / size
         bound = np.sqrt(np.diagonal(trials.crlb)[shown]) / size
-        bound = np.where(np.isfinite(bound), bound, np.nan)
+        bound = finite_or_nan(bound)
         tick = {"symbol": "|", "size": 10.0, "width": 1.4}
         low, high = trials.efficiency_interval[shown].T
         scatter += [
@@ -627,7 +628,7 @@ def robots(comparison: RobotComparison) -> Picture:
         title = f"{second} differs from {first} in {', '.join(names)}{others}"
     elif comparison.differs:
         title = f"{second} differs from {first}, but not in a single parameter"
-    labels = [with_unit(comparison.parameters[j], comparison.units[j]) for j in order]
+    labels = parameter_names(comparison, order, with_unit)
     panel = Panel(
         marks=marks,
         x=Axis(label="difference / difference that would be found [–]", limits=(-reach, reach)),

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import re
 import subprocess
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from itertools import cycle, islice
@@ -28,12 +27,8 @@ from mjfim.output.page import (
     MEASURED,
     NOMINAL,
     TERMS,
-    Emphasis,
-    Listing,
     Page,
-    Table,
     Term,
-    Text,
     shown_word,
 )
 from mjfim.output.pages import page_of
@@ -48,6 +43,7 @@ from mjfim.output.plots.design import (
 )
 from mjfim.output.plots.estimate import deciding_seconds, fit, held_out, residual_torque
 from mjfim.output.plots.studies import fan_panels, valley
+from mjfim.output.report import template
 from mjfim.output.rerun.camera import Camera, place_camera
 from mjfim.output.rerun.plots import (
     PLOTS_PER_ROW,
@@ -255,20 +251,7 @@ def log_trajectories(
     further = cycle(FURTHER_ROLES)
     known = (INITIAL, DESIGNED)
     roles = {name: name if name in known else next(further) for name in named}
-    states = {
-        group: [
-            replace(
-                panel,
-                marks=[
-                    replace(mark, label=name) for mark, name in zip(panel.marks, named, strict=True)
-                ],
-            )
-            for panel in panels
-        ]
-        for group, panels in motion_panels(
-            labels, {roles[name]: each for name, each in named.items()}
-        ).items()
-    }
+    states = motion_panels(labels, named, roles=roles)
     robots = _robots(model, poses, ASPECT_WITHOUT_TEXT, roles)
     with open_recording(path, model, "replay", robots, series_tabs(states)) as rec:
         log_series(rec, states)
@@ -553,47 +536,10 @@ def show(path: Path) -> None:
         )
 
 
-# Characters that Markdown would take for its own marks; an underscore only at the edge of a word.
-MARKS = re.compile(r"[\\|*`<>\[\]~]|(?<!\w)_|_(?!\w)")
-
-
 def as_markdown(page: Page, *further: str) -> str:
     """Write a page: verdict, remarks by their weight, all parts, and further sentences."""
-    remarks = (
-        f"**{weight}**\n\n{_list(sentences)}"
-        for weight, sentences in page.remarks.items()
-        if sentences
-    )
-    parts = [*remarks, *map(_rendered, page.parts)]
-    texts = (f"### {escape(page.kind)}", f"**{escape(page.verdict.sentence)}**", *parts, *further)
-    return "\n\n".join(text for text in texts if text)
-
-
-def escape(text: str) -> str:
-    """Return a text on one line, without a character that Markdown takes for a mark."""
-    return MARKS.sub(lambda mark: f"\\{mark[0]}", " ".join(text.split()))
-
-
-def _list(sentences: Iterable[str]) -> str:
-    return "\n".join(f"- {escape(sentence)}" for sentence in sentences)
-
-
-def _rendered(part: Table | Text | Listing) -> str:
-    if isinstance(part, Text):
-        text = escape(part.text)
-        return f"**{text}**" if part.emphasis is Emphasis.STRONG else text
-    title = f"**{escape(part.title)}**" if part.title else ""
-    if isinstance(part, Table):
-        rules = [":--" if part.is_left(k) else "--:" for k in range(len(part.columns))]
-        rows = [part.columns, *(row.cells for row in part.rows)]
-        lines = [f"| {' | '.join(escape(cell) for cell in cells)} |" for cells in rows]
-        lines.insert(1, f"| {' | '.join(rules)} |")
-        blocks = ["\n".join(lines), escape(part.note)]
-    elif part.code:
-        blocks = [f"```toml\n{item}\n```" for item in part.items]
-    else:
-        blocks = [_list(part.items)]
-    return "\n\n".join(block for block in (title, *blocks) if block)
+    text = template("summary.md.j2").render(page=page).strip()
+    return "\n\n".join([text, *filter(None, further)])
 
 
 def _colours(*meanings: tuple[Term, str]) -> str:

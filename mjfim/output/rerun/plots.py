@@ -214,7 +214,7 @@ class Plane:
             (values - low) / (high - low) for values, (low, high) in ((x, self.x), (up, self.y))
         ]
         points = np.column_stack([SIZE[0] * shares[0], SIZE[1] * (1.0 - shares[1])])
-        return np.asarray(points[np.isfinite(points).all(axis=1)])
+        return points[np.isfinite(points).all(axis=1)]
 
     def curve(self, x: Array, y: Array, role: str, width: float = 1.0) -> rr.LineStrips2D:
         """Return a curve."""
@@ -308,4 +308,4 @@ def round_numbers(low: float, high: float) -> Array:
     )
     numbers = step * np.arange(np.ceil(low / step), np.floor(high / step) + 1.0)
     # Round-off at zero is not shown.
-    return np.asarray(np.where(np.abs(numbers) < 1e-9 * step, 0.0, numbers))
+    return np.where(np.abs(numbers) < 1e-9 * step, 0.0, numbers)

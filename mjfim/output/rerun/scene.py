@@ -196,7 +196,7 @@ def geom_origin(model: mujoco.MjModel, geom: int) -> Array:
     to_end = np.empty(3)
     half_length = float(model.geom_size[geom, 1])
     mujoco.mju_rotVecQuat(to_end, np.array([0.0, 0.0, -half_length]), model.geom_quat[geom])
-    return np.asarray(position + to_end)
+    return position + to_end
 
 
 def geom_shape(
@@ -413,7 +413,7 @@ class BodyPoses:
         w = self.quaternions[::every, bodies, :1]
         v = self.quaternions[::every, bodies, 1:]
         shifts = 2.0 * np.cross(v, np.cross(v, points) + w * points)
-        return np.asarray(self.positions[::every, bodies] + points + shifts)
+        return self.positions[::every, bodies] + points + shifts
 
 
 def body_poses(model: mujoco.MjModel, t: Array, qpos: Array) -> BodyPoses:

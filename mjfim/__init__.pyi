@@ -1,0 +1,51 @@
+"""The public names of the package; `__init__.py` imports each of them when it is used first."""
+
+from mjfim.errors import MjfimError as MjfimError
+from mjfim.excitation.design import design as design
+from mjfim.excitation.design import design_jointly as design_jointly
+from mjfim.excitation.evaluation import evaluate as evaluate
+from mjfim.excitation.evaluation import simulate as simulate
+from mjfim.excitation.rehearsal import rehearse as rehearse
+from mjfim.excitation.shortest_horizon import ShortestExperiment as ShortestExperiment
+from mjfim.excitation.shortest_horizon import shortest_experiment as shortest_experiment
+from mjfim.experiment.schema import Experiment as Experiment
+from mjfim.identification.assessment.parameter_draws import draw_parameters as draw_parameters
+from mjfim.identification.identify import identify as identify
+from mjfim.identification.inverse_dynamics import inverse_dynamics as inverse_dynamics
+from mjfim.identification.left_out import predict as predict
+from mjfim.identification.meter import Meter as Meter
+from mjfim.output.export.design import export_design as export_design
+from mjfim.output.export.sysid import export_sysid as export_sysid
+from mjfim.output.export.sysid import sysid_control as sysid_control
+from mjfim.output.film import save_video as save_video
+from mjfim.output.rerun.live import live as live
+from mjfim.parallel import ExecutorLike as ExecutorLike
+from mjfim.parallel import Pool as Pool
+from mjfim.parallel import Workers as Workers
+from mjfim.parallel.budget import Budget as Budget
+from mjfim.parallel.budget import StopToken as StopToken
+from mjfim.records.campaign import Campaign as Campaign
+from mjfim.records.check import Check as Check
+from mjfim.records.design import Design as Design
+from mjfim.records.estimate import Estimate as Estimate
+from mjfim.records.estimate_parts import InverseDynamicsFit as InverseDynamicsFit
+from mjfim.records.rehearsal import Rehearsal as Rehearsal
+from mjfim.records.robots import RobotComparison as RobotComparison
+from mjfim.records.studies import Comparison as Comparison
+from mjfim.records.studies import MonteCarloStudy as MonteCarloStudy
+from mjfim.records.trajectory import Recording as Recording
+from mjfim.records.trajectory import Trajectory as Trajectory
+from mjfim.records.worth import Watch as Watch
+from mjfim.records.worth import Worth as Worth
+from mjfim.studies.campaign import run_campaign as run_campaign
+from mjfim.studies.check import check as check
+from mjfim.studies.compare import compare as compare
+from mjfim.studies.first_experiment import propose as propose
+from mjfim.studies.monte_carlo import monte_carlo as monte_carlo
+from mjfim.studies.payload import identify_payload as identify_payload
+from mjfim.studies.robot_comparison import compare_estimates as compare_estimates
+from mjfim.studies.selected_models import selected_experiment as selected_experiment
+from mjfim.studies.selection import select_terms as select_terms
+from mjfim.studies.worth import worth as worth
+
+__version__: str
