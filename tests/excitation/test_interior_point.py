@@ -14,8 +14,8 @@ from mjfim.excitation.limits.constraints import constraint_set_of
 from mjfim.excitation.search.interior_problem import DIVERGED_POINT, InteriorProblem, values_of
 from mjfim.excitation.task import DesignTask
 from mjfim.optimize.projection_operator import Expansion
-from tests.support.limits import along_control, directions_of
-from tests.support.numerics import cart_task, directional_check
+from tests.support.limits import along_control, directions_of, slope_check
+from tests.support.numerics import Array, cart_task
 
 LIMITS = {
     "control": {"force": (-5.0, 4.5)},
@@ -55,11 +55,11 @@ def check(
 ) -> float:
     """Largest relative error of the slope of the problem's value along random controls."""
     gradient = expansion.gradient(np.zeros((task.samples, 1, task.space.nx)))
-    ways = directions_of(task, 4)
-    curves = [
-        lambda s, way=way: problem.value(problem.point(task.control + s * way)) for way in ways
-    ]
-    return directional_check([float(np.sum(gradient * way)) for way in ways], curves, h)
+
+    def value(ctrl: Array) -> float:
+        return problem.value(problem.point(ctrl))
+
+    return slope_check(task, gradient, value, directions_of(task, 4), h)
 
 
 @pytest.mark.parametrize("name", COSTS)

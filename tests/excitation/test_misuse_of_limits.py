@@ -230,7 +230,7 @@ def test_a_start_that_falls_is_refused_at_a_high_rate(tmp_path: Path) -> None:
         CART_PENDULUM.format(integrator="RK4").replace('timestep="0.01"', 'timestep="0.0005"'),
         tmp_path,
         rate=2000.0,
-        parameters={"m": {"target": "body/bob:mass"}},
+        parameters={"m": "body/bob:mass"},
         noise={"state": 0.01},
         initial={"qpos": (0.0, 2.0), "control": {"kind": "sine"}},
         boundary={"start": "rest"},

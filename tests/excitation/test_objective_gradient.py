@@ -49,7 +49,7 @@ def furuta(folder: Path) -> DesignTask:
     """The Qube, implicitfast, 20 steps per sample, neither limits nor contacts."""
     parameters = {
         "arm": {"target": "joint/theta:damping", "guess": 1e-3},
-        "gear": {"target": "actuator/motor:gear"},
+        "gear": "actuator/motor:gear",
     }
     control = {"kind": "sine", "amplitude": 5e-3, "frequency": 1.5}
     initial = {"qpos": (0.1, 0.3), "control": control}

@@ -156,7 +156,7 @@ def test_rotations_of_a_free_body_are_relative_to_the_stated_state(tmp_path: Pat
             "qpos": (0.0, 0.0, 1.0, 0.0, 1.0, 0.0, 0.0),
             "free": {"qpos:base.z": (1.0, 3.0), "qpos:base.rx": (-0.5, 0.5), "qvel:base.x": (0, 1)},
         },
-        parameters={"mass": {"target": "body/b:mass"}},
+        parameters={"mass": "body/b:mass"},
         noise={"state": 0.01},
         directory=tmp_path,
     )

@@ -74,12 +74,9 @@ def test_it_reaches_every_target(shorter: mjfim.ShortestExperiment) -> None:
     assert 0.8 * shorter.horizon < seconds.max() <= shorter.horizon
     assert f"Every wanted σ is reached after {seconds.max():.3g} s" in when_learnt(shorter.design)
 
-
-@pytest.mark.slow
-def test_an_experiment_shorter_by_the_tolerance_does_not(shorter: mjfim.ShortestExperiment) -> None:
-    """Checked by a separate design from the initial control."""
+    # One that is shorter by the tolerance misses a target, by a separate design.
     below = shorter.missed
-    assert below is not None and 0.0 < shorter.horizon - below.horizon <= shorter.tolerance + 1e-9
+    assert 0.0 < shorter.horizon - below.horizon <= shorter.tolerance + 1e-9
     less = round(shorter.horizon - shorter.tolerance, 6)
     assert worst(shorter.experiment.replace(horizon=less)) > 1.0
     assert below.ratio > 1.0 and f"{below.horizon:g} s" in str(shorter)
@@ -98,14 +95,6 @@ def test_the_horizon_may_become_longer_than_stated(shorter: mjfim.ShortestExperi
 
 
 @pytest.mark.slow
-def test_the_message_names_targets_out_of_reach_with_numbers() -> None:
-    hard = wanting({"m": 1e-3, "l": 0.02, "c": 0.0125}, horizon=0.6)
-    message = r"0\.8 s is too short: the target is missed by m \(σ 0\.\d+, wanted 0\.001\)"
-    with pytest.raises(OutOfReachError, match=message):
-        mjfim.shortest_experiment(hard, longest=0.8)
-
-
-@pytest.mark.slow
 def test_it_is_saved_and_loaded_with_its_experiment(
     shorter: mjfim.ShortestExperiment, tmp_path: Path
 ) -> None:
@@ -116,11 +105,6 @@ def test_it_is_saved_and_loaded_with_its_experiment(
     assert loaded.summary() == shorter.summary()
     assert_array_equal(loaded.design.trajectory.ctrl, shorter.design.trajectory.ctrl)
 
-
-@pytest.mark.slow
-def test_an_experiment_with_a_function_cannot_be_saved(
-    shorter: mjfim.ShortestExperiment, tmp_path: Path
-) -> None:
     function = {"m": {"function": lambda spec, value: None, "guess": 1.0}}
     values = shorter.experiment.model_dump(exclude_unset=True)
     stated = shorter.experiment.restated({**values, "parameters": function})
@@ -143,7 +127,8 @@ def test_the_default_longest_horizon_is_that_of_the_table(tmp_path: Path) -> Non
         descent={"starts": 1, "max_iterations": 2},
         rehearsal={"robots": 4},
     )
-    with pytest.raises(OutOfReachError, match=r"even 0\.6 s"):
+    message = r"even 0\.6 s is too short: the target is missed by m \(σ .*, wanted 0\.0001\)"
+    with pytest.raises(OutOfReachError, match=message):
         mjfim.shortest_experiment(hard)
 
 

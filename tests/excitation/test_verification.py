@@ -43,7 +43,7 @@ def spring_task(folder: Path, joint: str = "", motor: str = "", **tables: Any) -
     defaults = {
         "rate": 10.0,
         "horizon": 1.0,
-        "parameters": {"m": {"target": "body/ball:mass"}},
+        "parameters": {"m": "body/ball:mass"},
         "noise": {"state": 0.01},
         "initial": {"qvel": (SPEED,)},
         "control": {"kind": "sine", "amplitude": 1e-3, "frequency": 1.0},
@@ -201,7 +201,7 @@ def light_link(
     """The light link under a sine for 0.4 s, with two engine steps in each sample."""
     defaults = {
         "horizon": 0.4,
-        "parameters": {"m": {"target": "body/link:mass"}},
+        "parameters": {"m": "body/link:mass"},
         "noise": {"state": 0.01},
         "control": {"kind": "sine", "amplitude": 0.4, "frequency": 2.5},
     }
@@ -295,7 +295,7 @@ def test_limits_hold_with_the_solver_settings_of_the_model_too(
 ) -> None:
     """The limit is between the speeds with the exact solver and with that of the model."""
     text = COARSE_SOLVER.format(**solver)
-    tables = {"parameters": {"m": {"target": "body/lower:mass"}}, "noise": {"state": 0.01}}
+    tables = {"parameters": {"m": "body/lower:mass"}, "noise": {"state": 0.01}}
     task = make_task(text, tmp_path, **tables)
 
     # A plain loop over the user's file, and one with the solver settings of the design.

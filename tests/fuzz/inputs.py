@@ -24,7 +24,7 @@ from mjfim.parallel.budget import LAST_SECONDS
 from tests.fuzz.bad_inputs import Call
 from tests.fuzz.odd_inputs import bad_input, long_log, no_permission
 from tests.fuzz.outcome import TIME_LIMITS, Case, Outcome
-from tests.fuzz.result_files import PIXEL, faults_of, is_temporary
+from tests.fuzz.result_files import PIXEL, faults_in
 from tests.fuzz.workers import announce
 from tests.support.cli import PROCESS, write_experiment
 from tests.support.cli import run as run_here
@@ -259,10 +259,4 @@ def changes(folder: Path, before: dict[Path, bytes]) -> list[str]:
         for path, content in before.items()
         if not path.is_file() or path.read_bytes() != content
     ]
-    for path in folder.rglob("*"):
-        if not path.is_file() or path in before:
-            continue
-        found += faults_of(path)
-        if is_temporary(path):
-            found.append(f"{path.name} is a temporary file that stayed")
-    return found
+    return found + faults_in(set(folder.rglob("*")) - set(before))

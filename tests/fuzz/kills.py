@@ -21,14 +21,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import psutil
+
 from mjfim.parallel.budget import NOTHING_SENTENCE
 from tests.fuzz.inputs import make_study
 from tests.fuzz.outcome import Case, Outcome
-from tests.fuzz.result_files import faults_of, is_temporary
+from tests.fuzz.result_files import faults_in
 from tests.fuzz.workers import announce
 from tests.support.cli import PROCESS, write_experiment, write_wrong_guess
 from tests.support.contents import contents
 from tests.support.paths import ROOT, SCRIPTS
+
+Process = subprocess.Popen[bytes]
 
 # Hard limits of a study.
 LIMITS = "[limits]\nposition = { slide = [-1.0, 1.0] }\ncontrol = { force = [-5.0, 5.0] }\n"
@@ -89,21 +93,6 @@ CALLS = {
 }
 
 
-@dataclass(frozen=True, kw_only=True)
-class Reference:
-    """What a call does that nobody disturbs.
-
-    Attributes:
-        seconds: Its duration [s].
-        code: Its exit code.
-        files: Contents of its results by name.
-    """
-
-    seconds: float
-    code: int
-    files: dict[str, Any]
-
-
 def prepare(folder: Path) -> None:
     """Copy the inputs of all calls into an empty folder."""
     shutil.copytree(valid_study(), folder, dirs_exist_ok=True)
@@ -113,9 +102,8 @@ def prepare(folder: Path) -> None:
     shutil.copy(folder / "run.csv", folder / OUTPUT)
 
 
-def environment() -> dict[str, str]:
-    """Variables of the calls, which find the package wherever they run."""
-    return {**os.environ, "PYTHONPATH": str(ROOT)}
+# The calls find the package wherever they run.
+ENVIRONMENT = {**os.environ, "PYTHONPATH": str(ROOT)}
 
 
 def results_of(folder: Path) -> dict[str, Any]:
@@ -129,7 +117,7 @@ def completed(command: list[str], folder: Path) -> subprocess.CompletedProcess[s
     return subprocess.run(
         command,
         cwd=folder,
-        env=environment(),
+        env=ENVIRONMENT,
         stdin=subprocess.DEVNULL,
         capture_output=True,
         text=True,
@@ -139,8 +127,8 @@ def completed(command: list[str], folder: Path) -> subprocess.CompletedProcess[s
 
 
 @functools.cache
-def reference(name: str) -> Reference:
-    """Carry out a call without a kill."""
+def reference(name: str) -> tuple[float, int, dict[str, Any]]:
+    """Duration [s], exit code and results of a call that nobody disturbs."""
     with tempfile.TemporaryDirectory(dir=Path.cwd()) as place:
         folder = Path(place)
         prepare(folder)
@@ -149,7 +137,7 @@ def reference(name: str) -> Reference:
         seconds = time.monotonic() - begin
         if done.returncode not in (0, 1) or "Traceback" in done.stderr:
             raise RuntimeError(f"{name} fails without a kill: {done.stderr[-2000:]}")
-        return Reference(seconds=seconds, code=done.returncode, files=results_of(folder))
+        return seconds, done.returncode, results_of(folder)
 
 
 @functools.cache
@@ -265,23 +253,26 @@ def run(case: Case, folder: Path) -> Outcome:
     if os.name != "posix":
         return Outcome(case=case, group="skipped", description=f"{kill}: not on this system")
 
-    call, undisturbed = CALLS[kill.name], reference(kill.name)
+    call, (duration, _, wanted) = CALLS[kill.name], reference(kill.name)
     prepare(folder)
-    seconds = kill.share * undisturbed.seconds
+    seconds = kill.share * duration
+    # Time in which a call cannot handle a signal yet. A script begins with its imports.
+    can_hear = seconds >= (0.8 * duration if call.script else START_OF_PYTHON)
     with _started(call, folder, is_deaf=kill.is_deaf) as process:
         is_killed = _send(process, kill, seconds)
-        complaints = [*_ending(process, kill, seconds), *_orphans(process.pid)]
+        complaints = [*_ending(process, kill, can_hear), *_orphans(process.pid)]
 
-    told = _told(folder)
-    starts = _start(call, undisturbed)
-    if "Traceback" in told and seconds >= starts:
+    told = (folder / "stderr").read_text(encoding="utf-8", errors="replace")
+    if "Traceback" in told and can_hear:
         complaints.append("Traceback: " + "\n".join(told.splitlines()[-4:]))
-    complaints += _files(folder / OUTPUT, has_ended_itself="SIGKILL" not in kill.signals)
+    results = (folder / OUTPUT).rglob("*")
+    # Only SIGKILL leaves no time to remove a temporary file.
+    complaints += faults_in(results, may_be_temporary="SIGKILL" in kill.signals)
     if not kill.heard or kill.heard == (WORKER,):
-        complaints += _differences(folder, undisturbed)
-    elif "SIGKILL" not in kill.heard and seconds >= starts:
+        complaints += _differences(folder, wanted)
+    elif "SIGKILL" not in kill.heard and can_hear:
         complaints += _lost(folder, told)
-    complaints += [f"again: {fault}" for fault in _again(call, folder, undisturbed)]
+    complaints += [f"again: {fault}" for fault in _again(kill.name, folder)]
     return Outcome(
         case=case,
         group=kill.group if is_killed else "ended before",
@@ -291,7 +282,7 @@ def run(case: Case, folder: Path) -> Outcome:
 
 
 @contextlib.contextmanager
-def _started(call: Call, folder: Path, *, is_deaf: bool) -> Iterator[subprocess.Popen[bytes]]:
+def _started(call: Call, folder: Path, *, is_deaf: bool) -> Iterator[Process]:
     """Start a call in a session of its own; end everything that it has started at the end.
 
     In a new session, the children are recognised by their process group.
@@ -303,7 +294,7 @@ def _started(call: Call, folder: Path, *, is_deaf: bool) -> Iterator[subprocess.
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
             stderr=errors,
-            env=environment(),
+            env=ENVIRONMENT,
             start_new_session=True,
             preexec_fn=lambda: signal.signal(
                 signal.SIGINT, signal.SIG_IGN if is_deaf else signal.SIG_DFL
@@ -317,20 +308,7 @@ def _started(call: Call, folder: Path, *, is_deaf: bool) -> Iterator[subprocess.
         process.wait()
 
 
-def _told(folder: Path) -> str:
-    """What a call wrote on stderr."""
-    return (folder / "stderr").read_text(encoding="utf-8", errors="replace")
-
-
-def _start(call: Call, undisturbed: Reference) -> float:
-    """Time in which a call cannot handle a signal yet [s].
-
-    A script begins with the imports of all that it needs.
-    """
-    return 0.8 * undisturbed.seconds if call.script else START_OF_PYTHON
-
-
-def _send(process: subprocess.Popen[bytes], kill: Kill, seconds: float) -> bool:
+def _send(process: Process, kill: Kill, seconds: float) -> bool:
     """Send all signals; False if the process has ended before the first one."""
     if not _runs_on(process, seconds):
         return False
@@ -344,7 +322,7 @@ def _send(process: subprocess.Popen[bytes], kill: Kill, seconds: float) -> bool:
     return True
 
 
-def _runs_on(process: subprocess.Popen[bytes], seconds: float) -> bool:
+def _runs_on(process: Process, seconds: float) -> bool:
     """Wait, and return whether a process is still running after some seconds."""
     try:
         process.wait(seconds)
@@ -353,32 +331,21 @@ def _runs_on(process: subprocess.Popen[bytes], seconds: float) -> bool:
     return False
 
 
-def _kill_worker(process: subprocess.Popen[bytes]) -> bool:
+def _kill_worker(process: Process) -> bool:
     """Kill the first worker of a process that there is; False if the process ends before."""
     while process.poll() is None:
-        rows = _table("pid=,ppid=,stat=,args=")
-        own = [row for row in rows if row[1] == str(process.pid) and not row[2].startswith("Z")]
-        workers = [int(row[0]) for row in own if "spawn_main" in row[3]]
-        if workers:
-            with contextlib.suppress(ProcessLookupError):
-                os.kill(workers[-1], signal.SIGKILL)
-            return True
+        with contextlib.suppress(psutil.NoSuchProcess):
+            children = psutil.Process(process.pid).children()
+            workers = [each for each in children if "spawn_main" in " ".join(each.cmdline())]
+            if workers:
+                workers[-1].kill()
+                return True
         time.sleep(0.05)
     return False
 
 
-def _table(columns: str) -> list[list[str]]:
-    """Columns of all processes; the last column may hold blanks."""
-    listing = subprocess.run(
-        ["ps", "-A", "-ww", "-o", columns], capture_output=True, text=True, check=True
-    ).stdout
-    count = columns.count("=")
-    rows = [line.split(None, count - 1) for line in listing.splitlines()]
-    return [row for row in rows if len(row) == count]
-
-
-def _ending(process: subprocess.Popen[bytes], kill: Kill, seconds: float) -> list[str]:
-    """Describe what is wrong with the end of a process that got signals after some seconds."""
+def _ending(process: Process, kill: Kill, can_hear: bool) -> list[str]:
+    """Describe what is wrong with the end of a process that got signals."""
     limit = END_TIME if len(kill.heard) == 1 else SECOND_END_TIME
     limit = LONGEST_CALL if not kill.heard or kill.heard == (WORKER,) else limit
     try:
@@ -387,8 +354,7 @@ def _ending(process: subprocess.Popen[bytes], kill: Kill, seconds: float) -> lis
         return [f"no end {limit:g} s after {kill.signals[-1]}"]
 
     # Python itself cannot handle a signal while it starts.
-    is_fatal = seconds < _start(CALLS[kill.name], reference(kill.name))
-    fatal = [name for name in kill.heard if name == "SIGKILL" or (is_fatal and name != WORKER)]
+    fatal = [each for each in kill.heard if each == "SIGKILL" or not (can_hear or each == WORKER)]
     allowed = (0, 1, *(-signal.Signals[name] for name in fatal))
     return [] if code in allowed else [f"exit code {code} after {kill.group}"]
 
@@ -405,35 +371,25 @@ def _orphans(group: int) -> list[str]:
 
 def _alive(group: int) -> list[str]:
     """The commands of the processes of a group; ended ones that nobody has waited for count not."""
-    rows = _table("pgid=,stat=,args=")
-    return [row[-1][:100] for row in rows if row[0] == str(group) and not row[1].startswith("Z")]
-
-
-def _files(folder: Path, *, has_ended_itself: bool) -> list[str]:
-    """Describe the files that are not whole, and temporary files that should have been removed."""
-    found: list[str] = []
-    for path in sorted(folder.rglob("*")):
-        if not path.is_file():
-            continue
-        # Only SIGKILL leaves no time to remove a temporary file.
-        if not is_temporary(path):
-            found += faults_of(path)
-        elif has_ended_itself:
-            found.append(f"{path.name} is a temporary file that stayed")
+    found = []
+    for process in psutil.process_iter():
+        with contextlib.suppress(psutil.NoSuchProcess, ProcessLookupError):
+            if os.getpgid(process.pid) == group and process.status() != psutil.STATUS_ZOMBIE:
+                found.append(" ".join(process.cmdline())[:100])
     return found
 
 
-def _again(call: Call, folder: Path, undisturbed: Reference) -> list[str]:
+def _again(name: str, folder: Path) -> list[str]:
     """Repeat a call, and describe in what it differs from one that nobody disturbed."""
+    _, code, wanted = reference(name)
     try:
-        done = completed(call.command(again=True), folder)
+        done = completed(CALLS[name].command(again=True), folder)
     except subprocess.TimeoutExpired:
         return [f"no end after {LONGEST_CALL:g} s"]
 
-    if done.returncode != undisturbed.code:
-        code, wanted = done.returncode, undisturbed.code
-        return [f"exit code {code} instead of {wanted}: {done.stderr[-600:]}"]
-    return [*_files(folder / OUTPUT, has_ended_itself=True), *_differences(folder, undisturbed)]
+    if done.returncode != code:
+        return [f"exit code {done.returncode} instead of {code}: {done.stderr[-600:]}"]
+    return [*faults_in((folder / OUTPUT).rglob("*")), *_differences(folder, wanted)]
 
 
 def _lost(folder: Path, told: str) -> list[str]:
@@ -443,20 +399,10 @@ def _lost(folder: Path, told: str) -> list[str]:
     return [] if is_told or written else [f"the result is lost: {told[-300:]}"]
 
 
-def _differences(folder: Path, undisturbed: Reference) -> list[str]:
+def _differences(folder: Path, wanted: dict[str, Any]) -> list[str]:
     """Describe the results that differ from those of an undisturbed call."""
-    found, wanted = results_of(folder), undisturbed.files
-    faults = [f"{name} is missing" for name in wanted if name not in found]
+    found, names = results_of(folder), sorted(wanted)
+    faults = [f"{name} is missing" for name in names if name not in found]
     faults += [f"{name} is left over" for name in found if name not in wanted]
-    both = [name for name in wanted if name in found]
-    return faults + [
-        _difference(name, wanted[name], found[name]) for name in both if found[name] != wanted[name]
-    ]
-
-
-def _difference(name: str, wanted: Any, found: Any) -> str:
-    """Describe in what a file differs, shortly."""
-    if isinstance(wanted, list) and isinstance(found, list) and name.endswith(".json"):
-        keys = [one[0] for one, two in zip(wanted, found, strict=False) if one != two]
-        return f"{name} differs in {', '.join(map(str, keys[:5]))}"
-    return f"{name} differs"
+    differ = [name for name in names if name in found and found[name] != wanted[name]]
+    return faults + [f"{name} differs" for name in differ]

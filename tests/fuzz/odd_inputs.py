@@ -11,7 +11,6 @@ import shutil
 import tempfile
 import tomllib
 import zipfile
-from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -73,7 +72,7 @@ OUTPUTS = (
 OPTION_VALUES = ("-1", "0", "1", "nan", "inf", "1e300", "abc", "", "1.5", "99999999999999999999")
 
 COMPARE = ("compare", "study.toml", "-o", "out", "--seconds", "0.1")
-OPTIONS: tuple[tuple[Sequence[str], tuple[str, ...]], ...] = (
+OPTIONS = (
     (CHECK[:2], ("--threads", "--design", "--nonsense")),
     (DESIGN[:4], ("--threads", "--starts", "--shortest", "-x")),
     (SIMULATE, ("--seed", "--rate")),
@@ -105,7 +104,7 @@ EXECUTORS = (
 )
 
 # Calls with options whose values name nothing, and these values.
-NOTHING: tuple[tuple[Sequence[str], tuple[str, ...]], ...] = (
+NOTHING = (
     ((*MONTECARLO, "--executor"), EXECUTORS),
     ((*IDENTIFY, "--executor"), EXECUTORS),
     ((*COMPARE, "--methods"), ("", ",", " ", " , ,")),
@@ -143,9 +142,12 @@ def spoiled_words(rng: Rng, folder: Path) -> Call:
 
 # Encodings and dialects.
 
+# Texts by name, and whether each must be read, must be refused, or may be either.
+Texts = dict[str, tuple[str, bool | None]]
 
-def csv_texts(text: str) -> dict[str, tuple[str, bool | None]]:
-    """A CSV in other dialects, and whether it must be read, must be refused, or may be either."""
+
+def csv_texts(text: str) -> Texts:
+    """A CSV in other dialects."""
     header, _, rows = text.partition("\n")
     clock = re.sub(r"^[^,]+", lambda t: f"12:00:{float(t[0]):09.6f}", rows, flags=re.MULTILINE)
     return {
@@ -166,8 +168,8 @@ def csv_texts(text: str) -> dict[str, tuple[str, bool | None]]:
     }
 
 
-def toml_texts(text: str) -> dict[str, tuple[str, bool | None]]:
-    """An experiment file in other forms, and whether it must be read or be refused."""
+def toml_texts(text: str) -> Texts:
+    """An experiment file in other forms."""
     return {
         "CRLF": (text.replace("\n", "\r\n"), True),
         "CR": (text.replace("\n", "\r"), True),
@@ -488,7 +490,7 @@ def two_faults(rng: Rng, folder: Path) -> Call:
 
 
 # What is spoiled, with the share of the cases.
-SPOILERS: dict[Callable[[Rng, Path], Call], float] = {
+SPOILERS = {
     spoiled_experiment: 0.2,
     spoiled_model: 0.12,
     spoiled_recording: 0.16,

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import mujoco
 import numpy as np
@@ -14,7 +13,7 @@ from mjfim.errors import MjfimError
 from mjfim.experiment.system import System
 from mjfim.output.archive import write_design
 from mjfim.records.design import keeps_limits
-from tests.fuzz.bad_inputs import pick
+from tests.fuzz.bad_inputs import Tables, pick
 from tests.fuzz.mechanisms import random_mechanism
 from tests.fuzz.outcome import Case, Outcome
 from tests.fuzz.plants import Plant, Ranges, Rng, about_zero, random_plant
@@ -24,7 +23,6 @@ from tests.fuzz.player import (
     ROUNDING,
     ROUNDING_WITH_FEEDBACK,
     TURN,
-    model_with_force_sensors,
     play,
     read_reference,
     read_rows,
@@ -71,11 +69,11 @@ def run(case: Case, folder: Path) -> Outcome:
     return Outcome(case=case, group="claimed", description=description, complaint=complaint)
 
 
-def violations(plant: Plant, tables: dict[str, Any], folder: Path) -> list[str]:
+def violations(plant: Plant, tables: Tables, folder: Path) -> list[str]:
     """Describe what is violated where design.csv of a folder is played with and without feedback,
     and in the values of reference.csv.
     """
-    model = model_with_force_sensors(mujoco.MjSpec.from_file(str(folder / "plant.xml")))
+    model = mujoco.MjModel.from_xml_path(str(folder / "plant.xml"))
     rows, ranges = read_rows(folder / "design.csv"), all_ranges(plant, tables)
     period = 1.0 / tables.get("playback_rate", tables["rate"])
     ignored = tables["limits"].get("ignored", ())
@@ -96,7 +94,7 @@ def omissions(plant: Plant, warnings: tuple[str, ...]) -> list[str]:
     return [f"no warning names the range of {name}" for name in unheld if name not in told]
 
 
-def all_ranges(plant: Plant, tables: dict[str, Any]) -> Ranges:
+def all_ranges(plant: Plant, tables: Tables) -> Ranges:
     """Range of every limit by kind and name: where MJCF and file state one, both hold."""
     joints = [joint.name for joint in plant.joints]
     turning = [joint.name for joint in plant.joints if not joint.is_scalar]
@@ -128,7 +126,7 @@ def all_ranges(plant: Plant, tables: dict[str, Any]) -> Ranges:
     return ranges
 
 
-def by_coordinate(stated: dict[str, Any]) -> dict[str, Any]:
+def by_coordinate(stated: Tables) -> Tables:
     """A table in which the three ranges of a free joint have the names of its coordinates."""
     table = {}
     for name, value in stated.items():
@@ -138,13 +136,13 @@ def by_coordinate(stated: dict[str, Any]) -> dict[str, Any]:
     return table
 
 
-def random_tables(rng: Rng, plant: Plant) -> dict[str, Any]:
+def random_tables(rng: Rng, plant: Plant) -> Tables:
     substeps = int(rng.choice([1, 2, 4, 5]))
     sample = substeps * plant.timestep
     horizon = int(rng.integers(20, 60)) * sample
     count = min(int(rng.integers(1, 4)), len(plant.targets))
     chosen = rng.choice(plant.targets, count, replace=False).tolist()
-    tables: dict[str, Any] = {
+    tables = {
         "model": "plant.xml",
         "rate": 1.0 / sample,
         "horizon": horizon,
@@ -168,9 +166,9 @@ def random_tables(rng: Rng, plant: Plant) -> dict[str, Any]:
     return tables
 
 
-def _limits(rng: Rng, plant: Plant, horizon: float) -> dict[str, Any]:
+def _limits(rng: Rng, plant: Plant, horizon: float) -> Tables:
     """Random limits; each slide or hinge and each actuator states some of them."""
-    limits: dict[str, Any] = {}
+    limits = {}
     for joint in plant.joints:
         if joint.is_scalar:
             speed = joint.reach / horizon * rng.uniform(0.5, 5.0)
@@ -194,9 +192,9 @@ def _limits(rng: Rng, plant: Plant, horizon: float) -> dict[str, Any]:
 
 def _state_some(
     rng: Rng,
-    limits: dict[str, Any],
+    limits: Tables,
     name: str,
-    wanted: dict[str, Any],
+    wanted: Tables,
     chances: tuple[float, ...],
 ) -> None:
     for (kind, value), chance in zip(wanted.items(), chances, strict=True):
@@ -205,9 +203,9 @@ def _state_some(
             limits.setdefault(kind, {})[name] = stated
 
 
-def _boundary(rng: Rng, plant: Plant) -> dict[str, Any]:
+def _boundary(rng: Rng, plant: Plant) -> Tables:
     """A random boundary; most problems state none."""
-    boundary: dict[str, Any] = {"position": 0.01, "velocity": 0.02}
+    boundary = {"position": 0.01, "velocity": 0.02}
     if not plant.can_rest and rng.random() < 0.9:
         return boundary
     if rng.random() < 0.3:
@@ -215,7 +213,7 @@ def _boundary(rng: Rng, plant: Plant) -> dict[str, Any]:
     return {**boundary, "end": str(rng.choice(["free", "free", "free", "rest", "periodic"]))}
 
 
-def _control(rng: Rng, plant: Plant, horizon: float) -> dict[str, Any]:
+def _control(rng: Rng, plant: Plant, horizon: float) -> Tables:
     """A random initial control."""
     size = float(rng.choice([0.01, 0.1, 0.5]))
     return {
@@ -225,7 +223,7 @@ def _control(rng: Rng, plant: Plant, horizon: float) -> dict[str, Any]:
     }
 
 
-def complicate(rng: Rng, plant: Plant, tables: dict[str, Any]) -> None:
+def complicate(rng: Rng, plant: Plant, tables: Tables) -> None:
     """Add to the tables what only mechanisms have, or what chains do not state."""
     limits, horizon = tables["limits"], tables["horizon"]
     tables["initial"]["keyframe"] = "start"
@@ -271,7 +269,7 @@ def complicate(rng: Rng, plant: Plant, tables: dict[str, Any]) -> None:
         tables["robust"] = {"over": str(rng.choice(["mean", "worst"])), "samples": 2}
 
 
-def describe(plant: Plant, tables: dict[str, Any]) -> str:
+def describe(plant: Plant, tables: Tables) -> str:
     """Describe a problem in a line."""
     boundary = tables["boundary"]
     words = [*plant.features, f"{boundary.get('start', 'given')} to {boundary.get('end', 'free')}"]

@@ -194,14 +194,6 @@ def alone(blocks: Array) -> Condensed:
     )
 
 
-def test_common_unknowns_with_equal_bounds_stay() -> None:
-    dense, none = problem(3, inner=3, outer=4), np.zeros(3)
-    still = dense.condensed.step(0.0, np.ones(5), none, none)
-    close(still.private.ravel(), lstsq(dense.starts, -dense.r)[0])
-    assert not still.common.any()
-    assert still.common_length == 0.0
-
-
 @pytest.mark.parametrize("rank_deficient", [False, True])
 @pytest.mark.parametrize("shape", SHAPES)
 def test_elimination_gives_the_schur_complement(

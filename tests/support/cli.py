@@ -148,7 +148,7 @@ def write_experiment(home: Path, **lines: str) -> Path:
 
 def loads(text: str) -> dict[str, Any]:
     """Parse a JSON object."""
-    found: dict[str, Any] = json.loads(text)
+    found = json.loads(text)
     return found
 
 

@@ -51,13 +51,13 @@ def arm_text(joints: int, *, friction: bool = False, timestep: float = 0.0005) -
 
 def arm_parameters(joints: int, *, friction: bool = False, **of_inertia: Any) -> dict[str, Any]:
     """Inertias of all links, and damping, armature and dry friction of all joints."""
-    tables: dict[str, Any] = {}
+    tables = {}
     for i in range(1, joints + 1):
         tables[f"link{i}"] = {"inertial": f"link{i}", **of_inertia}
-        tables[f"damping{i}"] = {"target": f"joint/joint{i}:damping"}
-        tables[f"armature{i}"] = {"target": f"joint/joint{i}:armature"}
+        tables[f"damping{i}"] = f"joint/joint{i}:damping"
+        tables[f"armature{i}"] = f"joint/joint{i}:armature"
         if friction:
-            tables[f"friction{i}"] = {"target": f"joint/joint{i}:frictionloss"}
+            tables[f"friction{i}"] = f"joint/joint{i}:frictionloss"
     return tables
 
 
@@ -67,7 +67,7 @@ def arm_experiment(
     """Experiment of the arm in a folder, at 500 Hz, positions measured."""
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "arm.xml").write_text(arm_text(joints, friction=friction), encoding="utf-8")
-    defaults: dict[str, Any] = {
+    defaults = {
         "parameters": arm_parameters(joints, friction=friction),
         "noise": {f"qpos:joint{i}": 1e-4 for i in range(1, joints + 1)},
     }

@@ -34,7 +34,7 @@ def write_dataset(
     tables = []
     for number, features in enumerate(episodes):
         rows = len(next(iter(features.values())))
-        columns: dict[str, Any] = {
+        columns = {
             feature: pa.array(values.astype(np.float32).tolist())
             for feature, values in features.items()
         }
@@ -52,7 +52,7 @@ def write_dataset(
     else:
         pyarrow.parquet.write_table(pa.concat_tables(tables), data / "file-000.parquet")
 
-    described: dict[str, Any] = {
+    described = {
         feature: {
             "dtype": "float32",
             "shape": [values.shape[1] if values.ndim > 1 else 1],

@@ -38,7 +38,7 @@ POWERS = {"²": 2, "³": 3}
 
 # Units of the attributes of MJCF elements, by element; "*" is any element. Q stands for the unit of
 # the coordinate of a joint, and F for the unit of the force on it.
-ATTRIBUTES: dict[str, dict[str, str]] = {
+ATTRIBUTES = {
     "*": {"pos": "m", "fromto": "m", "mass": "kg", "margin": "m", "gap": "m"},
     "option": {"timestep": "s", "gravity": "m/s²", "wind": "m/s", "density": "kg/m³"},
     "inertial": {"diaginertia": "kg m²", "fullinertia": "kg m²"},

@@ -39,11 +39,12 @@ from mjfim.records.studies import (
     TrialStatistics,
 )
 from mjfim.records.terms import Term, TermNumber
-from mjfim.records.trajectory import Labels, Recording, Trajectory
+from mjfim.records.trajectory import Labels, Recording
 from mjfim.records.worth import Price, SensorWorth, Watch, Worth
 from tests.support.made_records import (
     bare_estimate,
     falling,
+    make_evaluation,
     make_recording_comparison,
     ten_iterates,
 )
@@ -96,26 +97,14 @@ def covariance(std: Array) -> Array:
 
 def evaluation(size: float, samples: int) -> Evaluation:
     """A sinusoid of a given size; a larger one tells more."""
-    t = np.linspace(0.0, 2.0, samples + 1)
-    wave = size * np.sin(6.0 * t)[:, None]
-    trajectory = Trajectory(
-        t=t,
-        qpos=wave,
-        qvel=6.0 * size * np.cos(6.0 * t)[:, None],
-        act=np.zeros((samples + 1, 0)),
-        ctrl=size * np.cos(t[:-1, None]),
-    )
-    std = 0.01 / size * THETA
-    return Evaluation(
-        trajectory=trajectory,
-        gain=np.zeros((samples, 1, 2)),
+    made, std = make_evaluation(1, 3, size, samples, speed=6.0), 0.01 / size * THETA
+    return replace(
+        made,
         sensitivity=np.zeros((samples + 1, 2, 3)),
         information=np.linalg.inv(covariance(std)),
-        eigenvalues=size**2 * np.array([1.0, 2.0, 3.0]),
         std=std,
-        std_over_time=falling(std, t),
-        criterion=size**-2,
-        cost=size**-2,
+        std_over_time=falling(std, made.trajectory.t),
+        cost=made.criterion,
     )
 
 
@@ -124,18 +113,18 @@ def design(name: str = "hinge", samples: int = 50, **changes: object) -> Design:
     history = ten_iterates()
     final = evaluation(1.0, samples)
     share = 0.9 * final.trajectory.qpos[:, 0]
-    fields: dict[str, object] = {
-        "status": Status.CONVERGED,
-        "parameters": PARAMETERS,
-        "theta": THETA,
-        "initial": evaluation(0.1, samples),
-        "final": final,
-        "history": history,
-        "slope": 1e-8,
-        "steps": 1000,
-        "seconds": 1.5,
-        "limits": {"position": 0.1},
-        "usage": (
+    made = Design(
+        status=Status.CONVERGED,
+        parameters=PARAMETERS,
+        theta=THETA,
+        initial=evaluation(0.1, samples),
+        final=final,
+        history=history,
+        slope=1e-8,
+        steps=1000,
+        seconds=1.5,
+        limits={"position": 0.1},
+        usage=(
             LimitUsage(
                 kind="position",
                 name=name,
@@ -145,10 +134,10 @@ def design(name: str = "hinge", samples: int = 50, **changes: object) -> Design:
                 upper=BOUND,
             ),
         ),
-        "labels": labels(name),
-        "rehearsal": rehearsal(name, steps=finite_steps(predicted=final.std)),
-    }
-    return Design(**{**fields, **changes})  # type: ignore[arg-type]
+        labels=labels(name),
+        rehearsal=rehearsal(name, steps=finite_steps(predicted=final.std)),
+    )
+    return replace(made, **changes)
 
 
 def estimate(name: str = "hinge", samples: int = 200, **changes: object) -> Estimate:
@@ -169,18 +158,21 @@ def estimate(name: str = "hinge", samples: int = 200, **changes: object) -> Esti
         PredictionErrors(name="new", outputs=(output,), rms=np.array([rms]), mae=np.array([rms]))
         for rms in (0.05, 0.2)
     ]
-    fields: dict[str, object] = {
-        "units": UNITS,
-        "covariance": covariance(std),
-        "chi2": 201.0,
-        "dof": 198,
-        "residual_rms": {output: 0.05},
-        "sigma": {output: 0.05},
-        "predicted": (predicted,),
-        "recordings": (recording,),
-        "nominal": (0.7 * predicted,),
-        "segments": (np.array([0.0, 1.0]),),
-        "whiteness": (
+    made = bare_estimate(
+        PARAMETERS,
+        THETA,
+        std,
+        units=UNITS,
+        covariance=covariance(std),
+        chi2=201.0,
+        dof=198,
+        residual_rms={output: 0.05},
+        sigma={output: 0.05},
+        predicted=(predicted,),
+        recordings=(recording,),
+        nominal=(0.7 * predicted,),
+        segments=(np.array([0.0, 1.0]),),
+        whiteness=(
             Whiteness(
                 output=output,
                 count=samples,
@@ -191,7 +183,7 @@ def estimate(name: str = "hinge", samples: int = 200, **changes: object) -> Esti
                 time=1.0,
             ),
         ),
-        "predictions": (
+        predictions=(
             Prediction(
                 name="logs/new.csv",
                 identified=errors[0],
@@ -202,14 +194,13 @@ def estimate(name: str = "hinge", samples: int = 200, **changes: object) -> Esti
                 nominal_outputs=0.8 * predicted,
             ),
         ),
-        "labels": labels(name),
-        "draws": draws(std),
-        "recording_comparison": make_recording_comparison(
+        labels=labels(name),
+        draws=draws(std),
+        recording_comparison=make_recording_comparison(
             PARAMETERS, UNITS, ("swing.csv", "other.csv", "third.csv")
         ),
-    }
-    arguments = {"parameters": PARAMETERS, "theta": THETA, "std": std, **fields, **changes}
-    return bare_estimate(**arguments)  # type: ignore[arg-type]
+    )
+    return replace(made, **changes)
 
 
 def draws(std: Array) -> ParameterDraws:
@@ -255,22 +246,22 @@ def check(parameters: tuple[str, ...] = PARAMETERS, **changes: object) -> Check:
         for name, unit, value in zip(parameters, UNITS, THETA.tolist(), strict=True)
     )
     std = np.array([row.std for row in rows])
-    fields: dict[str, object] = {
-        "source": "the initial control",
-        "horizon": 2.0,
-        "rows": rows,
-        "wanted": parameters,
-        "information": np.linalg.inv(covariance(std)),
-        "eigenvalues": np.array([1.0, 2.0, 30.0]),
-        "correlation": covariance(np.ones(3)),
-        "confounded": (ConfoundedPair(first=parameters[0], second=parameters[1], correlation=0.8),),
-        "not_separable": (),
-        "not_excited": (),
-        "self_test": SelfTest(recursion=1e-8, slope=1e-6),
-        "findings": ("every identifiable parameter reaches its wanted σ",),
-        "is_start": True,
-    }
-    return Check(**{**fields, **changes})  # type: ignore[arg-type]
+    made = Check(
+        source="the initial control",
+        horizon=2.0,
+        rows=rows,
+        wanted=parameters,
+        information=np.linalg.inv(covariance(std)),
+        eigenvalues=np.array([1.0, 2.0, 30.0]),
+        correlation=covariance(np.ones(3)),
+        confounded=(ConfoundedPair(first=parameters[0], second=parameters[1], correlation=0.8),),
+        not_separable=(),
+        not_excited=(),
+        self_test=SelfTest(recursion=1e-8, slope=1e-6),
+        findings=("every identifiable parameter reaches its wanted σ",),
+        is_start=True,
+    )
+    return replace(made, **changes)
 
 
 def comparison(parameters: tuple[str, ...] = PARAMETERS, **changes: object) -> Comparison:
@@ -297,20 +288,20 @@ def comparison(parameters: tuple[str, ...] = PARAMETERS, **changes: object) -> C
             (DESIGN, "mjfim's design", 1.0, MethodOutcome.INSIDE),
         )
     )
-    fields: dict[str, object] = {
-        "source": "study.toml",
-        "criterion": "E",
-        "nats": 0.0,
-        "parameters": parameters,
-        "units": UNITS,
-        "scale": THETA,
-        "nuisance": (),
-        "rows": rows,
-        "seconds": 1.0,
-        "seed": 0,
-        "weighted": False,
-    }
-    return Comparison(**{**fields, **changes})  # type: ignore[arg-type]
+    made = Comparison(
+        source="study.toml",
+        criterion="E",
+        nats=0.0,
+        parameters=parameters,
+        units=UNITS,
+        scale=THETA,
+        nuisance=(),
+        rows=rows,
+        seconds=1.0,
+        seed=0,
+        weighted=False,
+    )
+    return replace(made, **changes)
 
 
 def trials(std: Array, seed: int) -> TrialStatistics:
@@ -333,15 +324,15 @@ def trials(std: Array, seed: int) -> TrialStatistics:
 def study(parameters: tuple[str, ...] = PARAMETERS, **changes: object) -> MonteCarloStudy:
     """Trials along the initial and the designed trajectory."""
     sets = {"initial": trials(0.1 * THETA, 0), "final": trials(0.01 * THETA, 1)}
-    fields: dict[str, object] = {
-        "parameters": parameters,
-        "theta": THETA,
-        "measure_rate": 100.0,
-        "sets": sets,
-        "information": {name: np.linalg.inv(found.crlb) for name, found in sets.items()},
-        "labels": replace(labels(), parameters=parameters),
-    }
-    return MonteCarloStudy(**{**fields, **changes})  # type: ignore[arg-type]
+    made = MonteCarloStudy(
+        parameters=parameters,
+        theta=THETA,
+        measure_rate=100.0,
+        sets=sets,
+        information={name: np.linalg.inv(found.crlb) for name, found in sets.items()},
+        labels=replace(labels(), parameters=parameters),
+    )
+    return replace(made, **changes)
 
 
 def finite_steps(
@@ -375,38 +366,38 @@ def rehearsal(
         RehearsedLimit(kind=kind, name=name, lower=-1.0, upper=1.0, scale=1.0, unit=unit)
         for kind, unit in (("position", "rad"), ("velocity", "rad/s"))
     )
-    fields: dict[str, object] = {
-        "parameters": parameters,
-        "wrong": 0.2,
-        "feedback": False,
-        "latency": 0.0,
-        "theta": THETA * (1.0 + 0.2 * random.uniform(-1.0, 1.0, (21, 3))),
-        "limits": limits,
-        "margins": np.array([0.4, 0.5]) + 0.1 * random.uniform(-1.0, 1.0, (21, 2)),
-        "joints": ("slide", name),
-        "units": ("m/s", "rad/s"),
-        "speed": rows * np.array([0.5, 0.6]),
-        "acceleration": rows * np.array([5.0, 6.0]),
-        "end_speed": rows * np.array([0.001, 0.002]),
-        "travel": rows * np.array([0.3, 1.2]),
-        "unlimited": ("slide",),
-        "unplaced": ("slide",),
-        "lowest": 0.2 * rows[:, 0],
-        "floor": 0.0,
-        "has_floor": True,
-        "depth": 0.01,
-        "end_height": 0.3 * rows[:, 0],
-        "nearest": 0.1 * rows[:, 0],
-        "in_contact": 0.0 * rows[:, 0],
-        "at_stop": 0.0 * rows[:, 0],
-        "unbraked": {},
-        "steps": finite_steps(parameters),
-        "fans": tuple(map(fan, limits)),
-        "motions": RobotMotions(
+    made = Rehearsal(
+        parameters=parameters,
+        wrong=0.2,
+        feedback=False,
+        latency=0.0,
+        theta=THETA * (1.0 + 0.2 * random.uniform(-1.0, 1.0, (21, 3))),
+        limits=limits,
+        margins=np.array([0.4, 0.5]) + 0.1 * random.uniform(-1.0, 1.0, (21, 2)),
+        joints=("slide", name),
+        units=("m/s", "rad/s"),
+        speed=rows * np.array([0.5, 0.6]),
+        acceleration=rows * np.array([5.0, 6.0]),
+        end_speed=rows * np.array([0.001, 0.002]),
+        travel=rows * np.array([0.3, 1.2]),
+        unlimited=("slide",),
+        unplaced=("slide",),
+        lowest=0.2 * rows[:, 0],
+        floor=0.0,
+        has_floor=True,
+        depth=0.01,
+        end_height=0.3 * rows[:, 0],
+        nearest=0.1 * rows[:, 0],
+        in_contact=0.0 * rows[:, 0],
+        at_stop=0.0 * rows[:, 0],
+        unbraked={},
+        steps=finite_steps(parameters),
+        fans=tuple(map(fan, limits)),
+        motions=RobotMotions(
             robots=(1, 2), t=np.array([0.0, 2.0]), qpos=np.array([[[0.1]], [[0.2]]]) * rows[:2]
         ),
-    }
-    return Rehearsal(**{**fields, **changes})  # type: ignore[arg-type]
+    )
+    return replace(made, **changes)
 
 
 def campaign(parameters: tuple[str, ...] = PARAMETERS, **changes: object) -> Campaign:
@@ -422,35 +413,34 @@ def campaign(parameters: tuple[str, ...] = PARAMETERS, **changes: object) -> Cam
         )
         for number in (1, 2)
     )
-    fields: dict[str, object] = {
-        "parameters": parameters,
-        "wanted": 0.015 * THETA,
-        "rounds": rounds,
-        "status": CampaignStatus.REACHED,
-    }
-    return Campaign(**{**fields, **changes})  # type: ignore[arg-type]
+    made = Campaign(
+        parameters=parameters,
+        wanted=0.015 * THETA,
+        rounds=rounds,
+        status=CampaignStatus.REACHED,
+    )
+    return replace(made, **changes)
 
 
-# Function that makes the result of each verb.
 def robots(**changes: object) -> RobotComparison:
     """Two robots whose damping differs."""
     std = 0.01 * THETA
-    fields: dict[str, object] = {
-        "names": ("monday", "friday"),
-        "recordings": (3, 1),
-        "parameters": PARAMETERS,
-        "units": UNITS,
-        "is_single": np.array([1.0, 0.0, 1.0]),
-        "values": np.array([THETA, THETA + np.array([0.0, 0.001, 0.2])]),
-        "std": np.array([std, 1.5 * std]),
-        "interval": np.array([[-0.07, 0.07], [-0.04, 0.04], [0.18, 0.22]]),
-        "p": np.array([1.0, 0.8, 1e-20]),
-        "detectable": np.array([0.12, 0.06, 0.03]),
-        "joint_p": 1e-18,
-        "level": 0.05,
-        "remarks": ("of friday there is a single recording",),
-    }
-    return RobotComparison(**{**fields, **changes})  # type: ignore[arg-type]
+    made = RobotComparison(
+        names=("monday", "friday"),
+        recordings=(3, 1),
+        parameters=PARAMETERS,
+        units=UNITS,
+        is_single=np.array([1.0, 0.0, 1.0]),
+        values=np.array([THETA, THETA + np.array([0.0, 0.001, 0.2])]),
+        std=np.array([std, 1.5 * std]),
+        interval=np.array([[-0.07, 0.07], [-0.04, 0.04], [0.18, 0.22]]),
+        p=np.array([1.0, 0.8, 1e-20]),
+        detectable=np.array([0.12, 0.06, 0.03]),
+        joint_p=1e-18,
+        level=0.05,
+        remarks=("of friday there is a single recording",),
+    )
+    return replace(made, **changes)
 
 
 def worth(parameters: tuple[str, ...] = PARAMETERS, **changes: object) -> Worth:
@@ -470,49 +460,50 @@ def worth(parameters: tuple[str, ...] = PARAMETERS, **changes: object) -> Worth:
             halved=present / 1.4,
         )
 
-    fields = {
-        "source": "the design",
-        "horizon": 4.0,
-        "parameters": parameters,
-        "units": UNITS,
-        "target": 0.05 * THETA,
-        "is_stated": True,
-        "std": std,
-        "repeated": std / np.sqrt(2.0),
-        "faster": std / np.sqrt(2.0),
-        "sensors": (
+    made = Worth(
+        source="the design",
+        horizon=4.0,
+        parameters=parameters,
+        units=UNITS,
+        target=0.05 * THETA,
+        is_stated=True,
+        std=std,
+        repeated=std / np.sqrt(2.0),
+        faster=std / np.sqrt(2.0),
+        sensors=(
             sensor(f"angle of {parameters[0]}", 1.0),
             sensor("rate", 3.0),
             sensor("gyro of bob", 2.0, is_added=True),
         ),
-        "fewest": ("rate", "gyro of bob"),
-        "prices": (
+        fewest=("rate", "gyro of bob"),
+        prices=(
             Price(name="control of motor", step="10 % wider", predicted=-0.07, redesigned=-0.068),
             Price(name="time", step="0.4 s more"),
         ),
-    }
-    return Worth(**{**fields, **changes})  # type: ignore[arg-type]
+    )
+    return replace(made, **changes)
 
 
 def watch(parameters: tuple[str, ...] = PARAMETERS, **changes: object) -> Watch:
     """A stream of 12 s, after which one of three parameters is known well enough."""
     t = np.linspace(0.0, 12.0, 60)
     std = np.outer(1.0 / np.sqrt(np.maximum(t, 0.1)), THETA * np.array([0.1, 0.2, 0.4]))
-    fields = {
-        "parameters": parameters,
-        "units": UNITS,
-        "sizes": np.abs(THETA),
-        "wanted": 0.05 * np.abs(THETA),
-        "is_stated": True,
-        "t": t,
-        "std_over_time": std,
-        "reached": np.array([4.0, np.inf, np.inf]),
-        "rows": 1200,
-        "left_out": 2,
-    }
-    return Watch(**{**fields, **changes})  # type: ignore[arg-type]
+    made = Watch(
+        parameters=parameters,
+        units=UNITS,
+        sizes=np.abs(THETA),
+        wanted=0.05 * np.abs(THETA),
+        is_stated=True,
+        t=t,
+        std_over_time=std,
+        reached=np.array([4.0, np.inf, np.inf]),
+        rows=1200,
+        left_out=2,
+    )
+    return replace(made, **changes)
 
 
+# Function that makes the result of each verb.
 MAKERS = {
     "compare-robots": robots,
     "design": design,

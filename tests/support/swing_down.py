@@ -56,7 +56,7 @@ def swing_down(
     )
     (folder / "swing_down.xml").write_text(text, encoding="utf-8")
 
-    values: dict[str, Any] = {
+    values = {
         "model": "swing_down.xml",
         "rate": 50.0,
         "horizon": 3.0,
