@@ -206,7 +206,7 @@ RESTING = {
     ids=["weights", "odd samples", "rest to rest"],
 )
 def test_a_shorter_design_played_several_times_is_a_start(
-    tmp_path: Path, count: int, tables: dict[str, Any]
+    tmp_path: Path, count: int, tables: Any
 ) -> None:
     """A part of the horizon has about as much information per second; costs hold for all of it."""
     descent = {"repeats": (count,), "max_iterations": 4}
@@ -234,7 +234,7 @@ COMBINATION = {"criterion": "c", "combination": {"m": 1.0, "c": -0.5}}
     ids=["A", "D", "c", "robust"],
 )
 @pytest.mark.slow
-def test_every_criterion_improves_within_limits(tmp_path: Path, tables: dict[str, Any]) -> None:
+def test_every_criterion_improves_within_limits(tmp_path: Path, tables: Any) -> None:
     cost = {"control": 0.0, **tables.get("cost", {})}
     task = cart_inside(tmp_path, **{**tables, "cost": cost, "descent": {"max_iterations": 6}})
     design = design_task(task)

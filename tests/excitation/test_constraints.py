@@ -250,7 +250,7 @@ SPEEDS = {"limits": {"velocity": 2.0, "angular_velocity": 6.0}}
     ("make", "tables"), [(swinging, {"limits": EVERY}), (floating_task, SPEEDS)]
 )
 def test_the_derivative_by_a_range_is_that_of_a_narrower_range(
-    make: Any, tables: dict[str, Any], tmp_path: Path
+    make: Any, tables: Any, tmp_path: Path
 ) -> None:
     task = make(tmp_path, **tables)
     constraints, delta, h = constraint_set_of(task), 0.01, 1e-6

@@ -88,9 +88,7 @@ def test_a_fourier_series_comes_with_its_basis(begins: bool, ends: bool, tmp_pat
 
 
 @pytest.mark.parametrize(("limits", "most"), [({}, 50), ({"bandwidth": 5.0}, 5)])
-def test_a_series_without_any_harmonic_is_refused(
-    limits: dict[str, float], most: int, tmp_path: Path
-) -> None:
+def test_a_series_without_any_harmonic_is_refused(limits: Any, most: int, tmp_path: Path) -> None:
     task = arm(tmp_path, limits=limits, descent={"fourier": (60.0,)})
     message = rf"descent\.fourier: 60 Hz is above the bandwidth of {most} Hz"
     with pytest.raises(ExperimentError, match=message):
@@ -139,7 +137,7 @@ def test_a_repeated_control_is_the_first_part_of_the_initial_one_faded_to_rest(
     ],
 )
 def test_repeats_that_do_not_divide_or_lack_limits_are_refused(
-    tables: dict[str, Any], message: str, tmp_path: Path
+    tables: Any, message: str, tmp_path: Path
 ) -> None:
     with pytest.raises(ExperimentError, match=rf"descent\.repeats{message}"):
         initial_controls_of(arm(tmp_path, **tables), None)

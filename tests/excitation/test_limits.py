@@ -251,9 +251,7 @@ FORCED = XML.replace('type="hinge"', 'type="hinge" actuatorfrcrange="-6 7"').rep
         ),
     ],
 )
-def test_ranges_of_the_model_and_of_the_file_hold(
-    text: str, tables: dict[str, Any], expected: dict[str, Any]
-) -> None:
+def test_ranges_of_the_model_and_of_the_file_hold(text: str, tables: Any, expected: Any) -> None:
     """The file narrows the ranges of the model. One number holds for every name: it is the largest
     speed of a free body and the largest angular speed of a ball. A box is three ranges, and a
     coordinate narrows it.
@@ -320,7 +318,7 @@ def test_ranges_of_the_model_and_of_the_file_hold(
         ),
     ],
 )
-def test_wrong_limits_are_refused(text: str, tables: dict[str, Any], message: str) -> None:
+def test_wrong_limits_are_refused(text: str, tables: Any, message: str) -> None:
     """The message names the key, the fault and the valid alternatives."""
     with pytest.raises(ExperimentError, match=re.escape(message)):
         limits(text, **tables)
@@ -366,7 +364,7 @@ def test_every_control_of_an_actuator_has_its_range_and_label() -> None:
     ],
 )
 def test_clamped_forces_are_found_beside_actuators_with_several(
-    ctrl: list[float], names: tuple[str, ...]
+    ctrl: list[float], names: Any
 ) -> None:
     model = mujoco.MjModel.from_xml_string(SERVOED)
     still = Trajectory(

@@ -22,7 +22,7 @@ from tests.support.numerics import CART_PARAMETERS, Array, cart_task
 def information(seed: int, size: int) -> Array:
     """A well-conditioned information matrix."""
     root = np.random.default_rng(seed).standard_normal((2 * size, size))
-    return np.asarray(root.T @ root)
+    return root.T @ root
 
 
 def design_file(path: Path, names: list[str], matrix: Array, prior: Array | None = None) -> Path:
@@ -35,7 +35,7 @@ def design_file(path: Path, names: list[str], matrix: Array, prior: Array | None
 
 def marginal(matrix: Array, kept: list[int]) -> Array:
     """Information about some parameters where the others are unknown."""
-    return np.asarray(np.linalg.inv(np.linalg.inv(matrix)[np.ix_(kept, kept)]))
+    return np.linalg.inv(np.linalg.inv(matrix)[np.ix_(kept, kept)])
 
 
 TWO, THREE, FOUR = (information(size, size) for size in (2, 3, 4))

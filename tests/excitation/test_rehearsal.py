@@ -365,9 +365,7 @@ def arm_with(folder: Path, reserve: dict[str, float]) -> Any:
         (arm_with, {"velocity": 0.02}),
     ],
 )
-def test_the_first_cure_keeps_other_robots_safe(
-    make: Any, reserve: dict[str, float], tmp_path: Path
-) -> None:
+def test_the_first_cure_keeps_other_robots_safe(make: Any, reserve: Any, tmp_path: Path) -> None:
     """300 robots of another seed are played after what the advice says is really done."""
     experiment = make(tmp_path, reserve)
     design = mjfim.design(experiment, **SETTINGS)
@@ -543,7 +541,7 @@ def test_finite_steps_agree_with_plain_loops(friction: float, noise: float, tmp_
     [(1 / 1.401, False), (1 / 1.399, True), (1 / 0.701, True), (1 / 0.699, False)],
 )
 def test_ratios_from_0_7_to_1_4_confirm_a_standard_deviation(
-    change: float, is_confirmed: bool, causes: tuple[str, ...]
+    change: float, is_confirmed: bool, causes: Any
 ) -> None:
     """A finite step whose effect is `ratio` times the predicted one has σ / ratio. It is stated
     with its cause where it differs; a confirmed one stays.

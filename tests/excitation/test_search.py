@@ -37,7 +37,7 @@ def cost_of(task: DesignTask) -> LimitedCost:
 @pytest.mark.parametrize("count", [0, 1, 3])
 @pytest.mark.parametrize("tables", [{}, {"limits": {}, "cost": {"control": 1e-3}}])
 def test_a_stop_at_any_iterate_leaves_the_best_that_was_seen(
-    count: int, tables: dict[str, Any], tmp_path: Path
+    count: int, tables: Any, tmp_path: Path
 ) -> None:
     task, stop, seen = cart_inside(tmp_path, **tables), StopToken(), 0
 

@@ -142,39 +142,6 @@ def test_the_time_of_few_evaluations_is_enough_for_a_good_control(
 
 
 @pytest.mark.slow
-def test_time_for_a_few_random_controls_is_not_spent_on_a_descent_with_dry_friction(
-    clock: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A descent takes as long as some evaluations before its first step."""
-    # Two robots that are alike in the initial motion are sought after the time of the search.
-    monkeypatch.setattr("mjfim.excitation.design.valley", lambda *_, **__: None)
-    task = DesignTask.resolve(dry_arm_experiment(tmp_path), threads=1)
-    begun = clock()
-    initial = task.problem.point(task.initial).cost
-    evaluation = clock() - begun
-
-    costs = []
-    for seconds in (6 * evaluation, 12.2 * evaluation, 16 * evaluation):
-        tables = {"descent": {**ENDLESS, "seconds": seconds}, "rehearsal": {"robots": 0}}
-        task = DesignTask.resolve(dry_arm_experiment(tmp_path, **tables))
-        begun = clock()
-        design = design_task(task)
-        costs.append(design.final.cost)
-        assert keeps_limits(design)
-        assert all(row.mu == 0.0 for row in design.history)
-        assert design.status is Status.MAX_ITERATIONS
-
-        # All random controls are counted. Beyond its time, the design ends the last of them, whose
-        # growth and report take as long as some evaluations.
-        used = clock() - begun
-        assert design.steps > 0.5 * used * STEPS_PER_SECOND
-        assert used < seconds + 15.0 * evaluation
-
-    assert costs[0] < 0.3 * initial
-    assert costs == sorted(costs, reverse=True)
-
-
-@pytest.mark.slow
 def test_a_stop_during_the_descent_leaves_the_best_random_control(tmp_path: Path) -> None:
     """A descent begins from the initial control; what was found before must not be lost."""
     stop = StopToken()

@@ -198,85 +198,47 @@ KILLS = (
 )
 
 
-@dataclass(frozen=True, kw_only=True)
-class Kill:
-    """What is random in a case.
-
-    Attributes:
-        name: Name of the call.
-        signals: Names of the signals.
-        share: Time of the first signal, relative to the time of the undisturbed call.
-        gap: Time between two signals [s].
-        is_deaf: Whether the call ignores SIGINT from its begin, as a background job of a shell.
-    """
-
-    name: str
-    signals: tuple[str, ...]
-    share: float
-    gap: float
-    is_deaf: bool
-
-    @classmethod
-    def of(cls, case: Case) -> Kill:
-        """The kill of a case."""
-        rng = case.rng
-        signals = KILLS[rng.integers(len(KILLS))]
-        names = [name for name, call in CALLS.items() if call.has_workers or signals != (WORKER,)]
-        return cls(
-            name=names[rng.integers(len(names))],
-            signals=signals,
-            share=LATEST * float(rng.random()),
-            gap=LONGEST_GAP * float(rng.random()),
-            is_deaf=bool(rng.integers(2)),
-        )
-
-    @property
-    def heard(self) -> tuple[str, ...]:
-        """The signals to which the call reacts."""
-        return tuple(name for name in self.signals if not (self.is_deaf and name == "SIGINT"))
-
-    def __str__(self) -> str:
-        later = f" and {self.signals[1]} {self.gap:.2f} s later" if len(self.signals) > 1 else ""
-        deaf = ", SIGINT ignored" if self.is_deaf else ""
-        return f"{self.name}, {self.signals[0]} after {100 * self.share:.0f} %{later}{deaf}"
-
-    @property
-    def group(self) -> str:
-        """Name of the kind of kill for the counts."""
-        return "+".join(self.signals) + (" deaf" if self.is_deaf else "")
-
-
 def run(case: Case, folder: Path) -> Outcome:
     """Start a call, kill it after a random time, look at what is left, and repeat the call."""
-    kill = Kill.of(case)
-    announce(str(kill))
+    rng = case.rng
+    signals = KILLS[rng.integers(len(KILLS))]
+    names = [name for name, call in CALLS.items() if call.has_workers or signals != (WORKER,)]
+    name = names[rng.integers(len(names))]
+    share, gap = LATEST * float(rng.random()), LONGEST_GAP * float(rng.random())
+    # Half of the calls ignore SIGINT from their begin, as a background job of a shell.
+    is_deaf = bool(rng.integers(2))
+    heard = tuple(each for each in signals if not (is_deaf and each == "SIGINT"))
+    group = "+".join(signals) + " deaf" * is_deaf
+    description = f"{name}, {group} after {100 * share:.0f} %, {gap:.2f} s between signals"
+    announce(description)
     if os.name != "posix":
-        return Outcome(case=case, group="skipped", description=f"{kill}: not on this system")
+        reason = f"{description}: not on this system"
+        return Outcome(case=case, group="skipped", description=reason)
 
-    call, (duration, _, wanted) = CALLS[kill.name], reference(kill.name)
+    call, (duration, _, wanted) = CALLS[name], reference(name)
     prepare(folder)
-    seconds = kill.share * duration
+    seconds = share * duration
     # Time in which a call cannot handle a signal yet. A script begins with its imports.
     can_hear = seconds >= (0.8 * duration if call.script else START_OF_PYTHON)
-    with _started(call, folder, is_deaf=kill.is_deaf) as process:
-        is_killed = _send(process, kill, seconds)
-        complaints = [*_ending(process, kill, can_hear), *_orphans(process.pid)]
+    with _started(call, folder, is_deaf=is_deaf) as process:
+        is_killed = _send(process, signals, seconds, gap)
+        complaints = [*_ending(process, heard, can_hear), *_orphans(process.pid)]
 
     told = (folder / "stderr").read_text(encoding="utf-8", errors="replace")
     if "Traceback" in told and can_hear:
         complaints.append("Traceback: " + "\n".join(told.splitlines()[-4:]))
     results = (folder / OUTPUT).rglob("*")
     # Only SIGKILL leaves no time to remove a temporary file.
-    complaints += faults_in(results, may_be_temporary="SIGKILL" in kill.signals)
-    if not kill.heard or kill.heard == (WORKER,):
+    complaints += faults_in(results, may_be_temporary="SIGKILL" in signals)
+    if not heard or heard == (WORKER,):
         complaints += _differences(folder, wanted)
-    elif "SIGKILL" not in kill.heard and can_hear:
+    elif "SIGKILL" not in heard and can_hear:
         complaints += _lost(folder, told)
-    complaints += [f"again: {fault}" for fault in _again(kill.name, folder)]
+    complaints += [f"again: {fault}" for fault in _again(name, folder)]
     return Outcome(
         case=case,
-        group=kill.group if is_killed else "ended before",
-        description=f"{kill} = {seconds:.2f} s",
+        group=group if is_killed else "ended before",
+        description=f"{description} = {seconds:.2f} s",
         complaint="; ".join(complaints),
     )
 
@@ -308,16 +270,16 @@ def _started(call: Call, folder: Path, *, is_deaf: bool) -> Iterator[Process]:
         process.wait()
 
 
-def _send(process: Process, kill: Kill, seconds: float) -> bool:
+def _send(process: Process, signals: tuple[str, ...], seconds: float, gap: float) -> bool:
     """Send all signals; False if the process has ended before the first one."""
     if not _runs_on(process, seconds):
         return False
-    if kill.signals == (WORKER,):
+    if signals == (WORKER,):
         return _kill_worker(process)
 
-    process.send_signal(signal.Signals[kill.signals[0]])
-    for name in kill.signals[1:]:
-        if _runs_on(process, kill.gap):
+    process.send_signal(signal.Signals[signals[0]])
+    for name in signals[1:]:
+        if _runs_on(process, gap):
             process.send_signal(signal.Signals[name])
     return True
 
@@ -344,19 +306,19 @@ def _kill_worker(process: Process) -> bool:
     return False
 
 
-def _ending(process: Process, kill: Kill, can_hear: bool) -> list[str]:
-    """Describe what is wrong with the end of a process that got signals."""
-    limit = END_TIME if len(kill.heard) == 1 else SECOND_END_TIME
-    limit = LONGEST_CALL if not kill.heard or kill.heard == (WORKER,) else limit
+def _ending(process: Process, heard: tuple[str, ...], can_hear: bool) -> list[str]:
+    """Describe what is wrong with the end of a process that heard some signals."""
+    limit = END_TIME if len(heard) == 1 else SECOND_END_TIME
+    limit = LONGEST_CALL if not heard or heard == (WORKER,) else limit
     try:
         code = process.wait(limit)
     except subprocess.TimeoutExpired:
-        return [f"no end {limit:g} s after {kill.signals[-1]}"]
+        return [f"no end {limit:g} s after the last signal"]
 
     # Python itself cannot handle a signal while it starts.
-    fatal = [each for each in kill.heard if each == "SIGKILL" or not (can_hear or each == WORKER)]
+    fatal = [each for each in heard if each == "SIGKILL" or not (can_hear or each == WORKER)]
     allowed = (0, 1, *(-signal.Signals[name] for name in fatal))
-    return [] if code in allowed else [f"exit code {code} after {kill.group}"]
+    return [] if code in allowed else [f"exit code {code}"]
 
 
 def _orphans(group: int) -> list[str]:

@@ -49,7 +49,7 @@ class _Builder:
         self.features: list[str] = []
         self.targets: list[str] = []
         self.drives: list[Drive] = []
-        self.timestep = float(rng.choice(TIMESTEPS))
+        self.timestep = rng.choice(TIMESTEPS)
         self.gravity = float(rng.choice([0.0, 0.0, 9.81]))
 
         # A loop closes only where all hinges have parallel axes.
@@ -126,7 +126,7 @@ class _Builder:
             joint = Joint(
                 name=f"joint{i}",
                 kind=kind,
-                reach=float(rng.uniform(0.3, 2.0)) * (1.0 if is_turning else 0.5 * arm),
+                reach=rng.uniform(0.3, 2.0) * (1.0 if is_turning else 0.5 * arm),
                 inertia=load * arm**2 if is_turning else load,
                 mass=masses[i],
                 length=lengths[i],
@@ -158,7 +158,7 @@ class _Builder:
         pose += ' gravcomp="1"' if self.is_compensated else ""
         place = self.joints[i - 1].length if i else 0.0
         thin = 0.05 * joint.mass * joint.length**2
-        size = joint.length * float(rng.uniform(0.05, 0.12))
+        size = joint.length * rng.uniform(0.05, 0.12)
         thicknesses = (thin, 2.0 * thin)
         return body_text(
             joint, attributes, place, thicknesses, size, pose=pose, is_solid=self.collides
@@ -171,10 +171,10 @@ class _Builder:
             if self.is_loop:
                 attributes["axis"] = "0 1 0"
         else:
-            rate = float(rng.choice([0.1, 1.0, 5.0]))
+            rate = rng.choice([0.1, 1.0, 5.0])
             attributes = {"type": joint.kind, "damping": joint.inertia * rate}
         if joint.kind == "ball" and self.chance(0.25):
-            largest = float(rng.uniform(0.5, 2.0))
+            largest = rng.uniform(0.5, 2.0)
             attributes["range"] = (0.0, largest)
             self.ranges["position", joint.name] = (-largest, largest)
         if self.is_compensated and joint.kind != "free" and self.chance(0.7):
@@ -250,7 +250,7 @@ class _Builder:
         tags = (*TAGS, "intvelocity")
         if not joint.is_scalar:
             tags, width = ("motor",), COMPONENTS[joint.kind]
-            size = float(self.rng.choice([1.0, -1.0, 5.0]))
+            size = self.rng.choice([1.0, -1.0, 5.0])
             gear = tuple(size if i == k % width else 0.0 for i in range(width))
         self._add(name, {"joint": joint.name}, joint, tags, gear)
 
@@ -296,7 +296,7 @@ class _Builder:
             if joint.is_scalar:
                 around = (-joint.reach, joint.reach)
                 bounds = self.ranges.get(("position", joint.name), around)
-                numbers.append(size * float(self.rng.uniform(*bounds)))
+                numbers.append(size * self.rng.uniform(*bounds))
                 continue
             if joint.kind == "free":
                 numbers += (size * self.rng.normal(size=3)).tolist()

@@ -17,6 +17,7 @@ import numpy as np
 import pyarrow
 import pyarrow.csv
 import pyarrow.parquet
+from rosbags.rosbag2 import StoragePlugin
 
 from tests.fuzz.bad_inputs import (
     CHECK,
@@ -39,8 +40,8 @@ from tests.fuzz.bad_inputs import (
     spoiled_experiment,
     spoiled_model,
     spoiled_recording,
-    toml_of,
 )
+from tests.support.ros2_bag import EPOCH, State, write
 
 # Words of the command line.
 
@@ -227,26 +228,31 @@ def same_log_twice(rng: Rng, folder: Path) -> Call:
     return Call(words=words, spoiled=f"the same log twice, {how}", refused=True)
 
 
+# Table of an experiment file for logs in bags.
+BAG = """
+[recording.columns]
+"qpos:slide" = "position:slide"
+"qpos:hinge" = "position:hinge"
+"qvel:slide" = "velocity:slide"
+"qvel:hinge" = "velocity:hinge"
+"ctrl:force" = "effort:slide"
+"""
+
+
 def spoiled_bag(rng: Rng, folder: Path) -> Call:
     """A ROS 2 bag of which something is spoiled."""
-    try:
-        from rosbags.rosbag2 import StoragePlugin
-
-        from tests.support.ros2_bag import EPOCH, State, write
-    except ImportError:
-        return same_log_twice(rng, folder)
-
     rows, spoiled, refused = rows_of(folder), "intact", False
     if rng.random() < 0.5:
         spoiled, refused = pick(rng, (few_rows, odd_numbers, odd_times))(rng, rows)
-    names, states = ("slide", "hinge"), []
+    states = []
     for row in rows[1:]:
         given = dict(zip(rows[0], (float(cell or "nan") for cell in row), strict=True))
         stamp = EPOCH + round(1e9 * float(np.clip(np.nan_to_num(given["t"]), 0.0, 1e6)))
         position, velocity = (
-            [given[f"{kind}:{name}"] for name in names] for kind in ("qpos", "qvel")
+            [given[f"{kind}:{name}"] for name in ("slide", "hinge")] for kind in ("qpos", "qvel")
         )
-        states.append(State(stamp, names, position, velocity, [given["ctrl:force"], 0.0]))
+        effort = [given["ctrl:force"], 0.0]
+        states.append(State(stamp, ("slide", "hinge"), position, velocity, effort))
     plugin = pick(rng, (StoragePlugin.SQLITE3, StoragePlugin.MCAP))
     bag = write(folder / "bag", plugin, {"/joints": states})
     files = list(bag.iterdir())
@@ -256,11 +262,8 @@ def spoiled_bag(rng: Rng, folder: Path) -> Call:
         file.write_bytes(content)
         spoiled, refused = f"{file.name} {how}", False
 
-    columns = {f"qpos:{name}": f"position:{name}" for name in names}
-    columns |= {f"qvel:{name}": f"velocity:{name}" for name in names}
     with (folder / "study.toml").open("a", encoding="utf-8") as experiment:
-        stated = {**columns, "ctrl:force": "effort:slide"}
-        experiment.write(f"\n[recording]\ncolumns = {toml_of(stated)}\n")
+        experiment.write(BAG)
     place = pick(rng, ("bag", *(f"bag/{file.name}" for file in files if file.suffix != ".yaml")))
     refused &= spoiled.endswith(" rows")
     return Call(words=identify(place), spoiled=f"{place}: {spoiled}", refused=refused)

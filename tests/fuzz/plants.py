@@ -115,7 +115,7 @@ def element(tag: str, inner: str | None = None, **attributes: Any) -> str:
 
 def log_uniform(rng: Rng, low: float, high: float) -> float:
     """A positive random number, uniform in its logarithm."""
-    return float(np.exp(rng.uniform(np.log(low), np.log(high))))
+    return np.exp(rng.uniform(np.log(low), np.log(high)))
 
 
 def about_zero(rng: Rng, size: float, least: float = 0.3) -> Range:
@@ -141,7 +141,7 @@ def random_plant(rng: Rng) -> Plant:
         joint = Joint(
             name=f"joint{i}",
             kind=kind,
-            reach=float(rng.uniform(0.3, 3.0)) if is_hinge else arm * float(rng.uniform(0.3, 1.0)),
+            reach=rng.uniform(0.3, 3.0) if is_hinge else arm * rng.uniform(0.3, 1.0),
             inertia=load * arm**2 if is_hinge else load,
             mass=masses[i],
             length=lengths[i],
@@ -155,9 +155,9 @@ def random_plant(rng: Rng) -> Plant:
         joints.append(joint)
 
     driven = [joint for joint in joints if rng.random() < 0.75] or [joints[0]]
-    timestep = float(rng.choice(TIMESTEPS))
+    timestep = rng.choice(TIMESTEPS)
     integrator = str(rng.choice(INTEGRATORS))
-    gravity = float(rng.choice([0.0, 0.0, 9.81, 1.6]))
+    gravity = rng.choice([0.0, 0.0, 9.81, 1.6])
     drives = [
         random_drive(rng, f"drive_{joint.name}", {"joint": joint.name}, joint, ranges)
         for joint in driven
@@ -272,7 +272,7 @@ def random_drive(
         is_bounded: Whether its control has a range.
     """
     tag = str(rng.choice(tags))
-    gear = gear or (float(rng.choice([1.0, -1.0, 20.0, 0.1])),)
+    gear = gear or (rng.choice([1.0, -1.0, 20.0, 0.1]),)
     size = max(map(abs, gear))
     force = control = joint.effort / size
     attributes = {"gear": gear}

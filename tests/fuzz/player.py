@@ -225,7 +225,7 @@ class Layout:
             pulled[self.model.actuator_trnid[i, 0]] += data.actuator_force[i]
         excess.see_all("force", self.drives, data.actuator_force)
         for joint in self.scalar:
-            excess.see("joint_force", joint.name, float(data.qfrc_actuator[joint.dofadr[0]]))
+            excess.see("joint_force", joint.name, data.qfrc_actuator[joint.dofadr[0]])
         excess.see_all("tendon_force", self.tendons, pulled)
         excess.see_all("tendon_length", self.tendons, data.ten_length)
 
@@ -233,9 +233,9 @@ class Layout:
         """Compare the motion of all joints with its limits."""
         for joint in self.scalar:
             q, v = int(joint.qposadr[0]), int(joint.dofadr[0])
-            excess.see("position", joint.name, float(data.qpos[q]))
-            excess.see("velocity", joint.name, float(data.qvel[v]))
-            excess.see("acceleration", joint.name, float(acceleration[v]))
+            excess.see("position", joint.name, data.qpos[q])
+            excess.see("velocity", joint.name, data.qvel[v])
+            excess.see("acceleration", joint.name, acceleration[v])
         if self.turning:
             mujoco.mj_kinematics(self.model, data)
         for joint in self.turning:
@@ -249,8 +249,8 @@ class Layout:
         """
         name, q, v = joint.name, int(joint.qposadr[0]), int(joint.dofadr[0])
         moved, changed = data.qvel[v : v + 3], acceleration[v : v + 3]
-        excess.see("velocity", name, float(np.linalg.norm(moved)))
-        excess.see("acceleration", name, float(np.linalg.norm(changed)))
+        excess.see("velocity", name, np.linalg.norm(moved))
+        excess.see("acceleration", name, np.linalg.norm(changed))
 
         body = int(joint.bodyid[0])
         turned = self._in_parent(self.reference, body).T @ self._in_parent(data, body)
@@ -271,7 +271,7 @@ class Layout:
             sine = np.linalg.norm(turned - turned.T) / np.sqrt(8.0)
             angle = np.arctan2(sine, 0.5 * (np.trace(turned) - 1.0))
             excess.see("position", name, float(angle))
-        excess.see("angular_velocity", name, float(np.linalg.norm(spin)))
+        excess.see("angular_velocity", name, np.linalg.norm(spin))
         excess.see_all("angular_velocity", [f"{name}{part}" for part in TURN], spin)
 
     def _in_parent(self, data: mujoco.MjData, body: int) -> np.ndarray:
@@ -304,6 +304,6 @@ def proximity(model: mujoco.MjModel, reach: float, ignored: Pairs) -> Callable[[
         mujoco.mj_fwdPosition(model, data)
         bodies = model.geom_bodyid[data.contact.geom]
         counted = [set(pair) not in pairs for pair in bodies.tolist()]
-        return float(data.contact.dist[counted].min(initial=reach))
+        return data.contact.dist[counted].min(initial=reach)
 
     return distance

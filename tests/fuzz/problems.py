@@ -186,7 +186,7 @@ def _limits(rng: Rng, plant: Plant, horizon: float) -> Tables:
         }
         _state_some(rng, limits, drive.name, wanted, (0.4, 0.3, 0.3))
     if rng.random() < 0.15:
-        limits["bandwidth"] = float(rng.uniform(2.0, 6.0)) / horizon
+        limits["bandwidth"] = rng.uniform(2.0, 6.0) / horizon
     return limits
 
 
@@ -215,11 +215,11 @@ def _boundary(rng: Rng, plant: Plant) -> Tables:
 
 def _control(rng: Rng, plant: Plant, horizon: float) -> Tables:
     """A random initial control."""
-    size = float(rng.choice([0.01, 0.1, 0.5]))
+    size = rng.choice([0.01, 0.1, 0.5])
     return {
         "kind": str(rng.choice(["sine", "chirp", "multisine"])),
         "amplitude": {drive.name: size * drive.control for drive in plant.drives} or 1.0,
-        "frequency": float(rng.uniform(0.5, 3.0)) / horizon,
+        "frequency": rng.uniform(0.5, 3.0) / horizon,
     }
 
 
@@ -243,7 +243,7 @@ def complicate(rng: Rng, plant: Plant, tables: Tables) -> None:
         size = joint.reach * rng.uniform(0.5, 2.0)
         box = tuple(about_zero(rng, size) for _ in PLACE)
         wanted = {
-            "position": box if joint.kind == "free" else (0.0, float(rng.uniform(0.4, 2.0))),
+            "position": box if joint.kind == "free" else (0.0, rng.uniform(0.4, 2.0)),
             "velocity": speed * rng.uniform(0.5, 5.0),
             "acceleration": speed / horizon * rng.uniform(5.0, 50.0),
             "angular_velocity": rng.uniform(0.5, 5.0) / horizon,
@@ -254,10 +254,10 @@ def complicate(rng: Rng, plant: Plant, tables: Tables) -> None:
     for kind, power in (("velocity", 1), ("acceleration", 2)):
         if rng.random() < 0.15:
             fastest = max(joint.reach for joint in plant.joints) / horizon**power
-            limits[kind] = float(fastest * rng.uniform(3.0, 30.0))
+            limits[kind] = fastest * rng.uniform(3.0, 30.0)
     if plant.collides and rng.random() < 0.6:
         shortest = min(joint.length for joint in plant.joints)
-        limits["clearance"] = float(shortest * rng.uniform(0.001, 0.1))
+        limits["clearance"] = shortest * rng.uniform(0.001, 0.1)
         if len(plant.joints) > 2 and rng.random() < 0.3:
             limits["ignored"] = (("link0", "link2"),)
 

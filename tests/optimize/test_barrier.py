@@ -93,7 +93,7 @@ def test_the_barrier_of_bounds_is_the_sum_over_both_bounds(delta: float) -> None
     def values(numbers: Array) -> Array:
         sides = np.array([numbers - LOWER, UPPER - numbers]) / bounds.scale
         beta = relaxed_log_barrier(np.where(np.isfinite(sides), sides, 1.0), delta)[0]
-        return np.asarray(0.25 * beta.sum(axis=0))
+        return 0.25 * beta.sum(axis=0)
 
     barrier, up, down = (bounds.barrier(r + move, delta, 0.25) for move in (0.0, h, -h))
     assert barrier.value == pytest.approx(values(r).sum(), rel=1e-12)

@@ -122,7 +122,7 @@ def test_divided_differences_give_the_derivative_of_the_matrix_logarithm() -> No
     ids=["plain", "nuisance", "delay and sensors"],
 )
 def test_slopes_agree_with_the_logarithm_of_simulated_information(
-    tables: dict[str, Any], tmp_path: Path
+    tables: Any, tmp_path: Path
 ) -> None:
     """Compare along random controls, in the eigenvectors of the point, also off the diagonal."""
     task = cart_task(tmp_path, limits=LIMITS, **tables).relaxed()

@@ -5,7 +5,6 @@ Only the algorithm is tested, without MuJoCo.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import accumulate, pairwise
@@ -197,17 +196,13 @@ def test_the_optimum_does_not_depend_on_how_often_the_regulator_is_renewed(
 def test_convergence_compares_the_slope_with_the_cost() -> None:
     for tolerance in (1e-2, 1e-5):
         iterates = run(Pendulum(), METRIC, tolerance=tolerance)
-        assert iterates[-1].status is Status.CONVERGED
-        assert iterates[-1].slope <= tolerance * iterates[-1].value
-        assert all(i.slope > tolerance * i.value for i in iterates[:-1])
+        assert [i.slope <= tolerance * i.value for i in iterates].index(True) == len(iterates) - 1
 
 
 @pytest.mark.parametrize("limit", [0, 1, 3])
 def test_max_iterations_is_an_outcome_and_counts_accepted_steps(limit: int) -> None:
-    iterates = run(Pendulum(), METRIC, max_iterations=limit)
-    assert iterates[-1].status is Status.MAX_ITERATIONS
-    assert iterates[-1].index == limit
-    assert not iterates[-1].status.success
+    last = run(Pendulum(), METRIC, max_iterations=limit)[-1]
+    assert (last.status, last.index) == (Status.MAX_ITERATIONS, limit)
 
 
 class Wrong(Pendulum):
@@ -224,7 +219,7 @@ class Wrong(Pendulum):
 @pytest.mark.parametrize("refinements", [0, 2])
 @pytest.mark.parametrize("make", [partial(Pendulum, sign=-1.0), Wrong])
 def test_a_wrong_gradient_stalls_and_never_raises_the_cost(
-    make: Callable[..., Pendulum], refinements: int, method: str
+    make: Any, refinements: int, method: str
 ) -> None:
     """Better differences are used before."""
     problem = make(refinements=refinements)
@@ -302,11 +297,9 @@ def test_the_line_search_ends_with_its_time_and_the_descent_with_its_last_iterat
     assert searched(problem, -1.0, Armijo(is_over=lambda: next(asked)))[0] is None
     assert len(problem.values) == 5  # three trials between the start and itself
 
+    # An ascent direction is not called converged.
     iterates = run(Pendulum(), Upwards(), armijo=Armijo(is_over=lambda: True))
     assert [iterate.status for iterate in iterates] == [None]
-
-
-def test_an_ascent_direction_is_not_called_converged() -> None:
     iterates = run(Pendulum(), Upwards(), max_iterations=5)
     assert iterates[-1].status is not Status.CONVERGED
     assert iterates[-1].value <= iterates[0].value
@@ -324,7 +317,7 @@ def test_descent_continues_after_diverged_trials(optimum: float) -> None:
     "settings",
     [{"sigma": 0.0}, {"sigma": 0.5}, {"sigma": -1.0}, {"beta": 0.0}, {"beta": 1.0}, {"trials": 0}],
 )
-def test_armijo_refuses_settings_that_cannot_work(settings: dict[str, float]) -> None:
+def test_armijo_refuses_settings_that_cannot_work(settings: Any) -> None:
     with pytest.raises(ValueError, match="Armijo needs"):
         Armijo(**settings)
 
@@ -424,7 +417,3 @@ def test_only_pairs_of_clearly_positive_curvature_are_kept() -> None:
     kept = convex_pairs(s, y, 1e-8)
     assert [curvature for _, _, curvature in kept] == [3.0]
     assert_array_equal(kept[0][1], y[0])
-
-    for step, change in zip(s, y, strict=True):
-        alone = convex_pairs(step[None], change[None], 1e-8)
-        assert len(alone) == (float(step @ change) > 1.0)

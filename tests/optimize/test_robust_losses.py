@@ -26,12 +26,12 @@ def points(seed: int) -> Array:
     rng = np.random.default_rng(seed)
     y = 2.0 - 5.0 * T + rng.standard_normal(len(T))
     y[::8] += rng.uniform(8.0, 30.0, len(y[::8]))
-    return np.asarray(y)
+    return y
 
 
 def residuals(x: Array, y: Array) -> Array:
     """Residuals of the points from a line."""
-    return np.asarray(x[0] + x[1] * T - y)
+    return x[0] + x[1] * T - y
 
 
 def reweighted(loss: RobustLoss, y: Array) -> Array:
@@ -40,7 +40,7 @@ def reweighted(loss: RobustLoss, y: Array) -> Array:
     for _ in range(2000):
         w = loss.weight(residuals(x, y))
         x = x - np.linalg.lstsq(A * w[:, None], residuals(x, y) * w)[0]
-    return np.asarray(x)
+    return x
 
 
 @pytest.mark.parametrize("kind", KINDS)

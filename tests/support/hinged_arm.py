@@ -21,7 +21,7 @@ TORQUES = (3.0, 3.0, 1.7, 1.7, 1.0, 0.4, 0.4)
 POSE = (0.0, 0.6, 0.0, -1.4, 0.0, 1.0, 0.0)
 
 
-def arm_text(joints: int, *, friction: bool = False, timestep: float = 0.0005) -> str:
+def arm_text(joints: int, *, friction: bool = False) -> str:
     """MJCF of the arm, with motors and sensors of their torques."""
     bodies, ends, motors, sensors = [], [], [], []
     height = 0.0
@@ -42,7 +42,7 @@ def arm_text(joints: int, *, friction: bool = False, timestep: float = 0.0005) -
         sensors.append(f'<jointactuatorfrc name="torque{i + 1}" joint="joint{i + 1}"/>')
         height = length
     return (
-        f'<mujoco><option timestep="{timestep:g}" integrator="implicitfast">'
+        '<mujoco><option timestep="0.0005" integrator="implicitfast">'
         '<flag contact="disable"/></option>'
         f"<worldbody>{''.join(bodies)}{''.join(ends)}</worldbody>"
         f"<actuator>{''.join(motors)}</actuator><sensor>{''.join(sensors)}</sensor></mujoco>"
@@ -81,40 +81,30 @@ def arm_log(
     seconds: float,
     rng: np.random.Generator,
     *,
-    friction: bool = False,
     sigma: float = 0.0,
     torque_sigma: float = 0.0,
-    rate: float = 500.0,
 ) -> tuple[Recording, Array]:
     """Play a multisine with a controller, and log positions and torques.
 
     Returns:
         The recording with the columns `qpos:joint<i>` and `torque<i>`, and (M, joints) velocities.
     """
-    model = mujoco.MjModel.from_xml_string(arm_text(joints, friction=friction))
+    model = mujoco.MjModel.from_xml_string(arm_text(joints))
     data = mujoco.MjData(model)
-    substeps = round(1.0 / rate / model.opt.timestep)
-    count = round(seconds * rate)
-    t = np.arange(count + 1) / rate
+    t = np.arange(round(500.0 * seconds) + 1) / 500.0
     size = np.array(TORQUES[:joints])
     reference = np.array(POSE[:joints]) + 0.5 * multisine(t, joints, 0.2, 5, rng)
-    speed = np.gradient(reference, 1.0 / rate, axis=0)
+    speed = np.gradient(reference, t, axis=0)
 
-    q, v, u = np.zeros((3, count + 1, joints))
+    q, v, u = np.zeros((3, len(t), joints))
     data.qpos[:], data.qvel[:] = reference[0], speed[0]
-    for k in range(count + 1):
+    for k in range(len(t)):
         q[k], v[k] = data.qpos, data.qvel
         u[k] = 60.0 * size * (reference[k] - q[k]) + 6.0 * size * (speed[k] - v[k])
         data.ctrl[:] = u[k]
-        for _ in range(substeps):
-            mujoco.mj_step(model, data)
+        mujoco.mj_step(model, data, 4)
 
-    y = np.concatenate(
-        [
-            q + sigma * rng.standard_normal(q.shape),
-            u + torque_sigma * size * rng.standard_normal(u.shape),
-        ],
-        axis=1,
-    )
+    q_noise, u_noise = sigma * rng.standard_normal(q.shape), rng.standard_normal(u.shape)
+    y = np.hstack([q + q_noise, u + torque_sigma * size * u_noise])
     names = [f"{kind}{i}" for kind in ("qpos:joint", "torque") for i in range(1, joints + 1)]
     return Recording(t=t, ctrl=u[:-1], y=y, outputs=tuple(names), name="arm"), v

@@ -49,7 +49,7 @@ def make_labels(dofs: int, count: int, width: int = 0) -> Labels:
 def falling(std: Array, t: Array) -> Array:
     """Standard deviations that fall like the root of the time (n,) to the last ones: (n, p)."""
     with np.errstate(divide="ignore"):
-        return np.asarray(std * np.sqrt(t[-1] / t)[:, None])
+        return std * np.sqrt(t[-1] / t)[:, None]
 
 
 def make_evaluation(

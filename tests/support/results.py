@@ -92,7 +92,7 @@ def covariance(std: Array) -> Array:
     """Covariance with these standard deviations, in which the first two are correlated."""
     correlation = np.eye(len(std))
     correlation[0, 1] = correlation[1, 0] = CORRELATION
-    return np.asarray(correlation * np.outer(std, std))
+    return correlation * np.outer(std, std)
 
 
 def evaluation(size: float, samples: int) -> Evaluation:

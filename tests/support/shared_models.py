@@ -38,9 +38,9 @@ def chirp(amplitude: float, low: float, high: float, **more: Any) -> dict[str, A
     }
 
 
-def state_noise(joints: tuple[str, ...], q: float = 0.002, v: float = 0.02) -> dict[str, float]:
+def state_noise(*joints: str) -> dict[str, float]:
     """Return the noise of encoders [rad or m] and of their rates."""
-    return {f"qpos:{j}": q for j in joints} | {f"qvel:{j}": v for j in joints}
+    return {f"qpos:{j}": 0.002 for j in joints} | {f"qvel:{j}": 0.02 for j in joints}
 
 
 # The experiments by their names.
@@ -56,7 +56,7 @@ EXPERIMENTS = {
             "com": "body/pole:ipos[2]",
             "damping": "joint/hinge:damping",
         },
-        "noise": state_noise(("hinge",)),
+        "noise": state_noise("hinge"),
         "cost": {"criterion": "E", "control": 2e-4},
         "descent": {"tolerance": 1e-3},
     },
@@ -73,7 +73,7 @@ EXPERIMENTS = {
             "cart_damping": {"target": "joint/slider:damping", "guess": 0.5},
             "pole_damping": {"target": "joint/hinge_1:damping", "guess": 2e-3},
         },
-        "noise": state_noise(("slider", "hinge_1")),
+        "noise": state_noise("slider", "hinge_1"),
         "cost": {
             "criterion": "E",
             "control": 4e-3,
@@ -95,7 +95,7 @@ EXPERIMENTS = {
             "shoulder_damping": "joint/shoulder:damping",
             "elbow_damping": "joint/elbow:damping",
         },
-        "noise": state_noise(("shoulder", "elbow")),
+        "noise": state_noise("shoulder", "elbow"),
         "cost": {"criterion": "E", "control": 0.2},
         "descent": {"tolerance": 1e-3, "max_iterations": 15},
     },
@@ -111,7 +111,7 @@ EXPERIMENTS = {
             "arm_armature": {"target": "joint/theta:armature", "guess": 5e-6},
             "motor_gain": "actuator/motor:gainprm[0]",
         },
-        "noise": state_noise(("theta", "alpha")),
+        "noise": state_noise("theta", "alpha"),
         "cost": {"criterion": "E", "control": 200.0, "tracking": {"theta": 6e-3}},
         "descent": {"tolerance": 1e-2, "max_iterations": 15},
         "limits": {"control": {"motor": (-0.02, 0.02)}, "position": {"theta": (-2.0, 2.0)}},
@@ -147,7 +147,7 @@ EXPERIMENTS = {
             "pitch_friction": "joint/Pitch:frictionloss",
             "elbow_friction": "joint/Elbow:frictionloss",
         },
-        "noise": state_noise(SO_ARM),
+        "noise": state_noise(*SO_ARM),
         "cost": {
             "criterion": "E",
             "control": 2.0,
@@ -179,7 +179,7 @@ EXPERIMENTS = {
             "shoulder_armature": {"target": "joint/shoulder:armature", "guess": 0.05},
             "elbow_armature": {"target": "joint/elbow:armature", "guess": 0.02},
         },
-        "noise": state_noise(("shoulder", "elbow")),
+        "noise": state_noise("shoulder", "elbow"),
         "cost": {"criterion": "E", "control": 3.0, "control_about": ARM26},
         "descent": {"tolerance": 1e-2, "max_iterations": 60},
     },
@@ -195,7 +195,7 @@ EXPERIMENTS = {
             "link7_mass": "body/link7:mass",
             "link7_com": "body/link7:ipos[2]",
         },
-        "noise": state_noise(PANDA),
+        "noise": state_noise(*PANDA),
         "cost": {
             "criterion": "E",
             # The weights keep the stiff servos (kp 2000 and 500) inside their forcerange when the
