@@ -149,10 +149,10 @@ def test_the_gauss_newton_hessian_of_the_barrier_is_a_sum_of_weighted_squares(
             slacks, changes = member.slacks(values), member.slack_changes(values, zeta)
             bounded = np.isfinite(slacks)
             curvature = relaxed_log_barrier(slacks[bounded], 0.05)[2]
-            wanted.append(member.weight(values) * float(curvature @ changes[bounded] ** 2))
+            wanted.append(member.weight(values) * (curvature @ changes[bounded] ** 2))
         assert min(wanted) > 1e-6 * sum(wanted)
         a, b = expansion.barrier.weights.half_gradient(zeta)
-        found = float(np.sum(a * zeta.z) + np.sum(b * zeta.v))
+        found = np.sum(a * zeta.z) + np.sum(b * zeta.v)
         assert found == pytest.approx(sum(wanted), rel=1e-9)
 
 
@@ -298,7 +298,7 @@ def test_a_design_stays_above_a_floor_that_only_the_file_states(tmp_path: Path) 
         """Height of the lowest point of the rod along a design [m]."""
         ctrl = mjfim.design(stated.replace(limits=limits)).trajectory.ctrl
         angles = played(mujoco.MjModel.from_xml_string(ROD), (0.0, 0.0), ctrl, 4)["q"]
-        return float(0.3 - 0.02 + min(0.0, 0.5 * np.min(-np.sin(angles))))
+        return 0.3 - 0.02 + min(0.0, 0.5 * np.min(-np.sin(angles)))
 
     assert lowest() < 0.0
     assert lowest(clearance=0.05, floor=0.0) >= 0.05 - 1e-6

@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.testing import assert_allclose
 
 from mjfim.excitation.objective import DesignPoint
 from mjfim.excitation.search.levels import DescentLevel
@@ -241,7 +240,7 @@ def test_the_gradient_is_that_of_J_through_the_projection(
         assert relative_error(slopes, np.array(measured)) < accuracy
 
 
-def test_running_cost_and_its_gradient_are_the_stated_sum(tmp_path) -> None:
+def test_the_running_cost_is_the_stated_sum(tmp_path) -> None:
     task = cart_task(tmp_path, cost=TRACKING)
     running, rng = task.problem.running, np.random.default_rng(4)
     curve = task.plant.simulate(task.theta, task.control + rng.normal(size=task.control.shape))
@@ -250,9 +249,6 @@ def test_running_cost_and_its_gradient_are_the_stated_sum(tmp_path) -> None:
     total = 0.5 * np.sum(Q * away**2) + 0.5e-4 * np.sum(curve.ctrl**2)
     assert running.value(curve) == pytest.approx(total, rel=1e-12)
     assert running.value(task.initial) == pytest.approx(0.5e-4 * np.sum(task.control**2), rel=1e-12)
-    a, b = running.gradient(curve)
-    assert_allclose(a, [np.zeros(4), *(away * Q)], rtol=1e-12)
-    assert_allclose(b, 1e-4 * curve.ctrl, rtol=1e-12)
 
 
 def test_the_size_of_J_of_D_optimality_is_one_nat_per_parameter(tmp_path) -> None:

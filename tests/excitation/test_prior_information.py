@@ -95,7 +95,7 @@ def test_estimates_tell_how_much_wider_honest_deviations_are(tmp_path: Path) -> 
     _, inflation, sigma = known_from([first, second], ("a", "b", "c", "d"))
     logs = np.log([np.sqrt((30.0**2 + 40.0**2) / 2.0), 2.0, 1.0])
     # The variance of the logarithm of a standard deviation of four normal values, by its theory.
-    chance = float(polygamma(1, 1.5)) / 4.0
+    chance = polygamma(1, 1.5) / 4.0
     kept = 1.0 - chance / np.var(logs)
     wanted = np.exp(logs.mean() + kept * (logs - logs.mean()))
     assert_allclose(inflation[[0, 1, 3]], wanted, rtol=2e-3)

@@ -26,7 +26,7 @@ from mjfim.parallel.budget import StopToken
 from mjfim.records.design import Status
 from mjfim.records.events import DesignEvent, StudyEvent
 from tests.support.cart_pendulum import cart_pendulum
-from tests.support.cli import read, run
+from tests.support.cli import read, run, write_experiment
 from tests.support.paths import MODELS
 
 STUDY = cart_pendulum(
@@ -205,19 +205,10 @@ def test_control_of_another_duration(tmp_path: Path) -> None:
 @pytest.mark.usefixtures("empty_figures")
 def test_the_command_line(tmp_path: Path) -> None:
     """The design of the shortest horizon is written; exit code 1 where no horizon is enough."""
-    for name in ("cart_pendulum.xml", "cart_pendulum.csv"):
-        shutil.copy(MODELS / name, tmp_path)
-    text = (MODELS / "cart_pendulum.toml").read_text(encoding="utf-8")
-    text = f"rehearsal.robots = 1\n{text}"
-    for old, new in (
-        ("horizon = 4.0", "horizon = 1.0"),
-        ("max_iterations = 200", "max_iterations = 10"),
-        ("tolerance = 1e-7", "tolerance = 1e-2"),
-        ("[parameters.m] ", "[parameters.m]\nWANTED\n#"),
-    ):
-        assert old in text
-        text = text.replace(old, new, 1)
-    study, folder = tmp_path / "study.toml", tmp_path / "out"
+    study = write_experiment(tmp_path, tolerance="1e-2", max_iterations="10")
+    text = study.read_text(encoding="utf-8")
+    folder, old = tmp_path / "out", "[parameters.m] "
+    assert old in text
 
     # The table of the initial control ends after one second, which is the longest horizon then.
     table = (tmp_path / "cart_pendulum.csv").read_text(encoding="utf-8").splitlines()
@@ -228,7 +219,7 @@ def test_the_command_line(tmp_path: Path) -> None:
         ("", 2, "wanted"),
         ("wanted = 0.03", 0, "shortest horizon: "),
     ):
-        study.write_text(text.replace("WANTED", wanted), encoding="utf-8")
+        study.write_text(text.replace(old, f"[parameters.m]\n{wanted}\n#"), encoding="utf-8")
         done = run("design", study, "-o", folder, "--shortest")
         assert done.exit_code == code, done.output
         assert said in done.output

@@ -236,7 +236,7 @@ def test_a_force_or_acceleration_within_its_limit_is_never_shown_above_it(
     columns = reference_columns(simulate_playback(task.system, task.initial, gain), task.system)
     acceleration, speed = columns["qacc:hinge"], columns["qvel:hinge"]
     assert_allclose(acceleration[:-1], np.diff(speed) / 0.005, atol=1e-9)
-    largest = float(np.abs(acceleration).max())
+    largest = np.abs(acceleration).max()
     limits = {"acceleration": 1.001 * largest}
     limited = light_link(tmp_path, integrator, drive, limits=limits, **playback)
     margin = verify(limited, limited.initial).margins["acceleration"]

@@ -18,6 +18,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+import pytest
+
 from mjfim.files import replacing
 from mjfim.output.plots import draw
 from mjfim.parallel.budget import LAST_SECONDS
@@ -122,16 +124,11 @@ def _save_pixel(figure: object, path: Path, dpi: float = 0.0) -> Path:
 
 def in_this_process(call: Call, folder: Path) -> Ending:
     """Call the command line in this process, with figures of one pixel."""
-    home, save = Path.cwd(), draw.save
-    os.chdir(folder)
-    draw.save = _save_pixel
-    try:
-        with warnings.catch_warnings(record=True) as warned:
-            warnings.simplefilter("always")
-            result = run_here(*call.words)
-    finally:
-        draw.save = save
-        os.chdir(home)
+    with pytest.MonkeyPatch.context() as patch, warnings.catch_warnings(record=True) as warned:
+        patch.chdir(folder)
+        patch.setattr(draw, "save", _save_pixel)
+        warnings.simplefilter("always")
+        result = run_here(*call.words)
 
     fault = "; ".join(
         f"{w.category.__name__}: {w.message} ({w.filename}:{w.lineno})" for w in warned

@@ -13,11 +13,9 @@ import os
 import shutil
 import signal
 import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +28,7 @@ from tests.fuzz.result_files import faults_in
 from tests.fuzz.workers import announce
 from tests.support.cli import PROCESS, write_experiment, write_wrong_guess
 from tests.support.contents import contents
-from tests.support.paths import ROOT, SCRIPTS
+from tests.support.paths import ROOT
 
 Process = subprocess.Popen[bytes]
 
@@ -50,56 +48,29 @@ START_OF_PYTHON = 1.0
 LONGEST_CALL = 120.0
 
 
-@dataclass(frozen=True, kw_only=True)
-class Call:
-    """A call that is killed.
+# Calls of `mjfim` that are killed.
+CALLS = (
+    "check study.toml -o out",
+    "design study.toml -o out",
+    "design limited.toml -o out",
+    "design wanted.toml --shortest -o out",
+    "simulate study.toml design.npz -o out/made.csv",
+    "identify study.toml run.csv -o out",
+    "montecarlo study.toml design.npz -o out --trials 40",
+    "rehearse made -o out --robots 3",
+    "campaign guess.toml -o out --wanted 0.0055 --seed 5",
+    "replay made --save out/view.rrd",
+)
 
-    Attributes:
-        words: Its words, without the program.
-        again: Words that are added when it is repeated after a kill.
-        has_workers: Whether it has worker processes.
-        script: File of scripts/ that is called instead of `mjfim`; empty for a verb.
-    """
-
-    words: tuple[str, ...]
-    again: tuple[str, ...] = ()
-    has_workers: bool = False
-    script: str = ""
-
-    def command(self, *, again: bool = False) -> list[str]:
-        """The command line of the call, or of its repetition."""
-        program = [sys.executable, str(SCRIPTS / self.script)] if self.script else PROCESS
-        return [*program, *self.words, *(self.again if again else ())]
-
-
-FOLDER = ("-o", OUTPUT)
-CALLS = {
-    "check": Call(words=("check", "study.toml", *FOLDER)),
-    "design": Call(words=("design", "study.toml", *FOLDER)),
-    "design in a pool": Call(words=("design", "limited.toml", *FOLDER), has_workers=True),
-    "design --shortest": Call(words=("design", "wanted.toml", "--shortest", *FOLDER)),
-    "simulate": Call(words=("simulate", "study.toml", "design.npz", "-o", f"{OUTPUT}/made.csv")),
-    "identify": Call(words=("identify", "study.toml", "run.csv", *FOLDER)),
-    "montecarlo": Call(words=("montecarlo", "study.toml", "design.npz", *FOLDER, "--trials", "40")),
-    "rehearse": Call(words=("rehearse", "made", *FOLDER, "--robots", "3")),
-    "campaign": Call(
-        words=("campaign", "guess.toml", *FOLDER, "--wanted", "0.0055", "--seed", "5"),
-        again=("--resume",),
-    ),
-    "replay --save": Call(words=("replay", "made", "--save", f"{OUTPUT}/view.rrd")),
-    "identify_offline.py": Call(
-        words=("study.toml", f"{OUTPUT}/run.csv"), script="identify_offline.py"
-    ),
-}
+# Those with worker processes, and what is added to a call when it is repeated after a kill.
+WITH_WORKERS = CALLS[2:3]
+AGAIN = {CALLS[8]: " --resume"}
 
 
 def prepare(folder: Path) -> None:
     """Copy the inputs of all calls into an empty folder."""
     shutil.copytree(valid_study(), folder, dirs_exist_ok=True)
-
-    # The script writes beside the recording.
     (folder / OUTPUT).mkdir()
-    shutil.copy(folder / "run.csv", folder / OUTPUT)
 
 
 # The calls find the package wherever they run.
@@ -112,10 +83,10 @@ def results_of(folder: Path) -> dict[str, Any]:
     return {name: value for name, value in found.items() if Path(name).name not in BOOKKEEPING}
 
 
-def completed(command: list[str], folder: Path) -> subprocess.CompletedProcess[str]:
+def completed(call: str, folder: Path) -> subprocess.CompletedProcess[str]:
     """A call in a folder that has ended by itself."""
     return subprocess.run(
-        command,
+        [*PROCESS, *call.split()],
         cwd=folder,
         env=ENVIRONMENT,
         stdin=subprocess.DEVNULL,
@@ -127,16 +98,16 @@ def completed(command: list[str], folder: Path) -> subprocess.CompletedProcess[s
 
 
 @functools.cache
-def reference(name: str) -> tuple[float, int, dict[str, Any]]:
+def reference(call: str) -> tuple[float, int, dict[str, Any]]:
     """Duration [s], exit code and results of a call that nobody disturbs."""
     with tempfile.TemporaryDirectory(dir=Path.cwd()) as place:
         folder = Path(place)
         prepare(folder)
         begin = time.monotonic()
-        done = completed(CALLS[name].command(), folder)
+        done = completed(call, folder)
         seconds = time.monotonic() - begin
         if done.returncode not in (0, 1) or "Traceback" in done.stderr:
-            raise RuntimeError(f"{name} fails without a kill: {done.stderr[-2000:]}")
+            raise RuntimeError(f"{call} fails without a kill: {done.stderr[-2000:]}")
         return seconds, done.returncode, results_of(folder)
 
 
@@ -202,24 +173,22 @@ def run(case: Case, folder: Path) -> Outcome:
     """Start a call, kill it after a random time, look at what is left, and repeat the call."""
     rng = case.rng
     signals = KILLS[rng.integers(len(KILLS))]
-    names = [name for name, call in CALLS.items() if call.has_workers or signals != (WORKER,)]
-    name = names[rng.integers(len(names))]
+    call = str(rng.choice(WITH_WORKERS if signals == (WORKER,) else CALLS))
     share, gap = LATEST * float(rng.random()), LONGEST_GAP * float(rng.random())
     # Half of the calls ignore SIGINT from their begin, as a background job of a shell.
     is_deaf = bool(rng.integers(2))
     heard = tuple(each for each in signals if not (is_deaf and each == "SIGINT"))
     group = "+".join(signals) + " deaf" * is_deaf
-    description = f"{name}, {group} after {100 * share:.0f} %, {gap:.2f} s between signals"
+    description = f"{call}, {group} after {100 * share:.0f} %, {gap:.2f} s between signals"
     announce(description)
     if os.name != "posix":
         reason = f"{description}: not on this system"
         return Outcome(case=case, group="skipped", description=reason)
 
-    call, (duration, _, wanted) = CALLS[name], reference(name)
+    duration, _, wanted = reference(call)
     prepare(folder)
     seconds = share * duration
-    # Time in which a call cannot handle a signal yet. A script begins with its imports.
-    can_hear = seconds >= (0.8 * duration if call.script else START_OF_PYTHON)
+    can_hear = seconds >= START_OF_PYTHON
     with _started(call, folder, is_deaf=is_deaf) as process:
         is_killed = _send(process, signals, seconds, gap)
         complaints = [*_ending(process, heard, can_hear), *_orphans(process.pid)]
@@ -234,7 +203,7 @@ def run(case: Case, folder: Path) -> Outcome:
         complaints += _differences(folder, wanted)
     elif "SIGKILL" not in heard and can_hear:
         complaints += _lost(folder, told)
-    complaints += [f"again: {fault}" for fault in _again(name, folder)]
+    complaints += [f"again: {fault}" for fault in _again(call, folder)]
     return Outcome(
         case=case,
         group=group if is_killed else "ended before",
@@ -244,14 +213,14 @@ def run(case: Case, folder: Path) -> Outcome:
 
 
 @contextlib.contextmanager
-def _started(call: Call, folder: Path, *, is_deaf: bool) -> Iterator[Process]:
+def _started(call: str, folder: Path, *, is_deaf: bool) -> Iterator[Process]:
     """Start a call in a session of its own; end everything that it has started at the end.
 
     In a new session, the children are recognised by their process group.
     """
     with (folder / "stderr").open("wb") as errors:
         process = subprocess.Popen(
-            call.command(),
+            [*PROCESS, *call.split()],
             cwd=folder,
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
@@ -341,11 +310,11 @@ def _alive(group: int) -> list[str]:
     return found
 
 
-def _again(name: str, folder: Path) -> list[str]:
+def _again(call: str, folder: Path) -> list[str]:
     """Repeat a call, and describe in what it differs from one that nobody disturbed."""
-    _, code, wanted = reference(name)
+    _, code, wanted = reference(call)
     try:
-        done = completed(CALLS[name].command(again=True), folder)
+        done = completed(call + AGAIN.get(call, ""), folder)
     except subprocess.TimeoutExpired:
         return [f"no end after {LONGEST_CALL:g} s"]
 
@@ -357,8 +326,8 @@ def _again(name: str, folder: Path) -> list[str]:
 def _lost(folder: Path, told: str) -> list[str]:
     """Describe a call that was asked to stop and left no result, though it did not say so."""
     is_told = NOTHING_SENTENCE in told
-    written = {path.name for path in (folder / OUTPUT).rglob("*")} - {"run.csv"}
-    return [] if is_told or written else [f"the result is lost: {told[-300:]}"]
+    is_written = any((folder / OUTPUT).iterdir())
+    return [] if is_told or is_written else [f"the result is lost: {told[-300:]}"]
 
 
 def _differences(folder: Path, wanted: dict[str, Any]) -> list[str]:

@@ -6,9 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-# Kinds of cases; the place of a kind in this list is part of the seed of its random numbers.
-KINDS = ("problem", "input", "kill", "mechanism", "permission", "log")
-
 # Time after which a case has failed [s]. It includes the time that a busy machine takes from it.
 TIME_LIMITS = {
     "problem": 180.0,
@@ -18,6 +15,10 @@ TIME_LIMITS = {
     "permission": 180.0,
     "log": 600.0,
 }
+
+
+# Kinds of cases; the place of a kind in this list is part of the seed of its random numbers.
+KINDS = tuple(TIME_LIMITS)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -49,7 +49,7 @@ class Dense:
 
     def halves(self, step: Step) -> float:
         """Half of the squares after a step."""
-        return 0.5 * float(np.sum((self.J @ of_all(step) + self.r) ** 2))
+        return 0.5 * np.sum((self.J @ of_all(step) + self.r) ** 2)
 
     def left_of_shared(self) -> Array:
         """What the private unknowns cannot explain of the columns of the common ones."""
@@ -125,7 +125,7 @@ def problem(
 def close(value: Array, expected: Array, rtol: float = 1e-7) -> None:
     """Equal up to round-off of the largest entry."""
     assert value.shape == expected.shape
-    size = max(float(np.abs(expected).max(initial=0.0)), 1e-12)
+    size = max(np.abs(expected).max(initial=0.0), 1e-12)
     assert_allclose(value, expected, rtol=rtol, atol=rtol * size)
 
 
@@ -157,7 +157,7 @@ def test_a_step_solves_the_full_stacked_problem(shape: Any, damping: float, boun
         lower, upper = (np.concatenate([np.full(P * n, FREE), each]) for each in bounds)
         r = np.concatenate([dense.r, np.zeros(len(wide))])
         assert_least(rows, r, of_all(step), -lower, upper)
-        decrease = 0.5 * float(dense.r @ dense.r) - dense.halves(step)
+        decrease = 0.5 * (dense.r @ dense.r) - dense.halves(step)
         assert step.predicted_decrease == pytest.approx(decrease, rel=1e-8)
 
 
@@ -241,7 +241,7 @@ def test_undetermined_private_unknowns_do_not_break_the_step(damping: float) -> 
         dense = problem(seed, P=3, n=3, c=2, inner=0, outer=3, rank_deficient=True)
         step = dense.step(damping)
         assert not step.private[:, 2].any()
-        least = 0.5 * float(np.sum((dense.J @ lstsq(dense.J, -dense.r)[0] + dense.r) ** 2))
+        least = 0.5 * np.sum((dense.J @ lstsq(dense.J, -dense.r)[0] + dense.r) ** 2)
         assert dense.halves(step) == pytest.approx(least, rel=1e-4, abs=1e-4)
         assert np.isfinite(dense.condensed.information()).all()
 
@@ -250,7 +250,7 @@ def test_step_lengths_are_standard_deviations() -> None:
     """Common steps use the marginal information, private ones that at constant theta."""
     dense = problem(4, inner=3)
     step = dense.step()
-    length = float(np.linalg.norm(dense.left_of_shared() @ step.common))
+    length = np.linalg.norm(dense.left_of_shared() @ step.common)
     assert step.common_length == pytest.approx(length, rel=1e-8)
     private = np.linalg.norm(dense.starts @ step.private.ravel())
     assert step.private_length == pytest.approx(private / np.sqrt(step.private.size), rel=1e-8)

@@ -133,7 +133,7 @@ def reference(p: Analytic, start: UnknownValues) -> tuple[Array, Array, float]:
         max_nfev=5000,
     )
     best = unknowns(found.x)
-    return best.theta, best.private, float(found.cost)
+    return best.theta, best.private, found.cost
 
 
 def solved(
@@ -397,7 +397,7 @@ def test_the_last_linearisation_is_at_the_solution() -> None:
     assert_allclose(saved.condensed.information(), fresh.information(), rtol=1e-3)
 
     # Its residuals are those of the solution to first order.
-    squares = float(np.sum(saved.condensed.triangles[:, :, -1] ** 2))
+    squares = np.sum(saved.condensed.triangles[:, :, -1] ** 2)
     assert 0.5 * squares == pytest.approx(saved.cost, rel=1e-6)
 
 

@@ -29,7 +29,7 @@ def form(weights: Weights, z: np.ndarray, v: np.ndarray) -> float:
     changes = np.diff(v, axis=0, prepend=0.0, append=0.0)
     of_states = np.einsum("ki,kij,kj->", z, weights.Q, z)
     of_controls = np.einsum("ku,kuw,kw->", v, weights.R, v) + np.sum(weights.W * changes**2)
-    return float(of_states + of_controls + 2.0 * np.einsum("ku,kui,ki->", v, weights.S, z[:-1]))
+    return of_states + of_controls + 2.0 * np.einsum("ku,kui,ki->", v, weights.S, z[:-1])
 
 
 @pytest.mark.parametrize("steps", [False, True], ids=["free steps", "weighted steps"])
@@ -100,7 +100,7 @@ def test_weighted_descent_is_the_minimum(sizes: Any, steps: bool) -> None:
 
     def cost(v: np.ndarray) -> float:
         z = response(v)
-        return float(np.sum(a * z) + np.sum(b * v)) + 0.5 * form(weights, z, v)
+        return (np.sum(a * z) + np.sum(b * v)) + 0.5 * form(weights, z, v)
 
     zeta = RiccatiSolution.solve(A, B, weights).descent(a, b)
     assert_minimum(cost, zeta.v)

@@ -88,7 +88,7 @@ class Pendulum:
         """The quadratic cost, infinite beyond the wall, less the shift."""
         d, u = point.x - GOAL, point.u
         running = DT * (np.einsum("ki,ij,kj->", d[:-1], Q, d[:-1]) + R[0, 0] * np.sum(u**2))
-        whole = 0.5 * float(running + d[-1] @ TERMINAL @ d[-1])
+        whole = 0.5 * (running + d[-1] @ TERMINAL @ d[-1])
         self.values.append(whole - self.shift if np.abs(u).max() <= self.wall else np.inf)
         return self.values[-1]
 
@@ -167,7 +167,7 @@ def optimum() -> float:
 
     u = start(problem).u[:, 0]
     options = {"gtol": 1e-9, "maxiter": 800}
-    return float(minimize(cost, u, jac=True, method="BFGS", options=options).fun)
+    return minimize(cost, u, jac=True, method="BFGS", options=options).fun
 
 
 DIRECTIONS = {
@@ -303,14 +303,6 @@ def test_the_line_search_ends_with_its_time_and_the_descent_with_its_last_iterat
     iterates = run(Pendulum(), Upwards(), max_iterations=5)
     assert iterates[-1].status is not Status.CONVERGED
     assert iterates[-1].value <= iterates[0].value
-
-
-def test_descent_continues_after_diverged_trials(optimum: float) -> None:
-    free = run(Pendulum(), LBFGS(R * DT))
-    peak = np.abs(free[-1].point.u).max()
-    problem = Pendulum(wall=1.02 * peak)
-    iterates = run(problem, LBFGS(R * DT))
-    assert iterates[-1].value == pytest.approx(optimum, rel=1e-6)
 
 
 @pytest.mark.parametrize(

@@ -154,7 +154,7 @@ class Toy:
     def value(self, point: SimpleNamespace) -> float:
         """Sum of cost and barrier."""
         cost = 0.01 * np.sum((point.x[1:] - WANTED) ** 2) + 1e-4 * np.sum(point.u**2)
-        return float(cost + sum(barrier.value for barrier in self.barriers(point)))
+        return cost + sum(barrier.value for barrier in self.barriers(point))
 
     def size(self, point: SimpleNamespace) -> float:
         """Scale of a change of the cost."""

@@ -52,10 +52,10 @@ def command(t: float, values: np.ndarray, dt: float, width: float) -> float:
 
     def at(x: float) -> float:
         if x < 0.0:
-            return float(values[0] * x)
+            return values[0] * x
         if x > edges[-1]:
-            return float(integral[-1] + values[-1] * (x - edges[-1]))
-        return float(np.interp(x, edges, integral))
+            return integral[-1] + values[-1] * (x - edges[-1])
+        return np.interp(x, edges, integral)
 
     return (at(t + width) - at(t)) / width
 
@@ -72,7 +72,7 @@ def simulate(
 
     laws: by the number of the actuator. columns: of each actuator, by quantity, or "ctrl".
     """
-    h = float(model.opt.timestep)
+    h = model.opt.timestep
     substeps = round(dt / h)
     data = mujoco.MjData(model)
     data.qpos[:], data.qvel[:], data.act[:] = np.split(start, [model.nq, model.nq + model.nv])
@@ -80,7 +80,7 @@ def simulate(
     def measured(law: PlainLaw) -> tuple[float, float]:
         """Position and velocity of the joint of a law."""
         joint = data.joint(law.joint)
-        return float(joint.qpos[0]), float(joint.qvel[0])
+        return joint.qpos[0], joint.qvel[0]
 
     states, controls, running = [np.array(start)], [], {}
     for a, law in laws.items():
@@ -128,7 +128,7 @@ def controls_of(
             before = reference if is_first else profile
             # The latest row of the log that counts at this tick; a jump counts at two ticks.
             latest = math.ceil((t - law.latency + width) / dt - 1e-9) - 1
-            row = float(rows[min(max(latest, 0), len(rows) - 1)])
+            row = rows[min(max(latest, 0), len(rows) - 1)]
             jumps = last_row is not None and abs(row - last_row) > law.jump
             if jumps or has_jumped:
                 profile, speed = reference, 0.0
@@ -154,8 +154,8 @@ def controls_of(
             positions.append(q)
             velocities.append(v)
         past = t - law.feedback_latency
-        q = float(CubicHermiteSpline(times, positions, velocities)(past))
-        v = float(np.interp(past, times, velocities))
+        q = CubicHermiteSpline(times, positions, velocities)(past)
+        v = np.interp(past, times, velocities)
         if law.difference:
             v, last_position = (q - last_position) / T, q
         if law.velocity_time_constant:
@@ -163,7 +163,7 @@ def controls_of(
             v = filtered_velocity = v + decay * (filtered_velocity - v)
 
         sample = min(int(t / dt + 1e-9), len(rows) - 1)
-        gain = float(signals["gain"][sample]) if "gain" in signals else 1.0
+        gain = signals["gain"][sample] if "gain" in signals else 1.0
         limit = law.integral_limit
         integral = min(max(integral + gain * law.ki * T * (reference - q), -limit), limit)
 

@@ -170,7 +170,7 @@ def slope_check(
 ) -> float:
     """Largest relative error of a gradient (N, nu) against differences of a value of controls."""
     curves = [lambda s, way=way: value(task.control + s * way) for way in ways]
-    return directional_check([float(np.sum(gradient * way)) for way in ways], curves, h)
+    return directional_check([np.sum(gradient * way) for way in ways], curves, h)
 
 
 def barrier_check(task: DesignTask, delta: float) -> float:
