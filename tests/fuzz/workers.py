@@ -152,6 +152,7 @@ def _begin(home: str) -> None:
     sys.path.insert(0, str(ROOT))
     os.environ["PYTHONPATH"] = str(ROOT)
     os.chdir(home)
+    announce("")
 
 
 def _run_in_folder(case: Case) -> Outcome:

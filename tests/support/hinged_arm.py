@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from pathlib import Path
 from typing import Any
 
@@ -23,29 +24,29 @@ POSE = (0.0, 0.6, 0.0, -1.4, 0.0, 1.0, 0.0)
 
 def arm_text(joints: int, *, friction: bool = False) -> str:
     """MJCF of the arm, with motors and sensors of their torques."""
-    bodies, ends, motors, sensors = [], [], [], []
-    height = 0.0
-    for i in range(joints):
-        m, length = MASSES[i], LENGTHS[i]
-        loss = 0.3 * TORQUES[i] if friction else 0.0
+    bodies, height = "", 0.0
+    links = zip(AXES, LENGTHS, MASSES, TORQUES, strict=True)
+    for i, (axis, length, m, torque) in enumerate(itertools.islice(links, joints)):
         across, along = m * (length**2 / 12 + 9e-4), m * 1.8e-3
-        bodies.append(
+        bodies += (
             f'<body name="link{i + 1}" pos="0 0 {height:g}">'
-            f'<joint name="joint{i + 1}" axis="{AXES[i]}" damping="{0.5 * TORQUES[i]:g}" '
-            f'armature="0.05" frictionloss="{loss:g}"/>'
+            f'<joint name="joint{i + 1}" axis="{axis}" damping="{0.5 * torque:g}" '
+            f'armature="0.05" frictionloss="{0.3 * torque * friction:g}"/>'
             f'<inertial mass="{m:g}" pos="{0.01 + 0.004 * i:g} {0.005 * (i % 3):g} {length / 2:g}" '
             f'fullinertia="{across:g} {1.05 * across:g} {along:g} '
             f'{1e-4 * (i - 3):g} {2e-4 * (i % 2):g} {1e-4 * (i % 3 - 1):g}"/>'
         )
-        ends.append("</body>")
-        motors.append(f'<motor name="joint{i + 1}" joint="joint{i + 1}"/>')
-        sensors.append(f'<jointactuatorfrc name="torque{i + 1}" joint="joint{i + 1}"/>')
         height = length
+    names = [f"joint{i + 1}" for i in range(joints)]
+    motors = "".join(f'<motor name="{name}" joint="{name}"/>' for name in names)
+    sensors = "".join(
+        f'<jointactuatorfrc name="torque{name[5:]}" joint="{name}"/>' for name in names
+    )
     return (
         '<mujoco><option timestep="0.0005" integrator="implicitfast">'
         '<flag contact="disable"/></option>'
-        f"<worldbody>{''.join(bodies)}{''.join(ends)}</worldbody>"
-        f"<actuator>{''.join(motors)}</actuator><sensor>{''.join(sensors)}</sensor></mujoco>"
+        f"<worldbody>{bodies}{'</body>' * joints}</worldbody>"
+        f"<actuator>{motors}</actuator><sensor>{sensors}</sensor></mujoco>"
     )
 
 

@@ -179,25 +179,25 @@ def make_study(count: int = 3, failed: int = 5) -> MonteCarloStudy:
 
 def bare_estimate(parameters: Sequence[str], theta: Array, std: Array, **changes: Any) -> Estimate:
     """An estimate that converged with independent errors, from no recording."""
-    made = Estimate(
-        parameters=tuple(parameters),
-        labels=plain_labels(parameters),
-        theta=theta,
-        std=std,
-        covariance=np.diag(std**2),
-        initial_theta=1.2 * theta,
-        chi2=1.0,
-        dof=1,
-        status="converged",
-        converged=True,
-        misfit=False,
-        iterations=4,
-        residual_rms={},
-        at_bound=(),
-        predicted=(),
-        recordings=(),
-    )
-    return replace(made, **changes)
+    fields = {
+        "parameters": tuple(parameters),
+        "labels": plain_labels(parameters),
+        "theta": theta,
+        "std": std,
+        "covariance": np.diag(std**2),
+        "initial_theta": 1.2 * theta,
+        "chi2": 1.0,
+        "dof": 1,
+        "status": "converged",
+        "converged": True,
+        "misfit": False,
+        "iterations": 4,
+        "residual_rms": {},
+        "at_bound": (),
+        "predicted": (),
+        "recordings": (),
+    }
+    return Estimate(**{**fields, **changes})
 
 
 def make_estimate(dofs: int = 2, count: int = 3, misfit: bool = False) -> Estimate:

@@ -34,7 +34,6 @@ from mjfim.records.studies import (
     DESIGN,
     Comparison,
     MethodOutcome,
-    MethodResult,
     MonteCarloStudy,
     TrialStatistics,
 )
@@ -44,7 +43,9 @@ from mjfim.records.worth import Price, SensorWorth, Watch, Worth
 from tests.support.made_records import (
     bare_estimate,
     falling,
+    make_comparison,
     make_evaluation,
+    make_method_result,
     make_recording_comparison,
     ten_iterates,
 )
@@ -158,21 +159,21 @@ def estimate(name: str = "hinge", samples: int = 200, **changes: object) -> Esti
         PredictionErrors(name="new", outputs=(output,), rms=np.array([rms]), mae=np.array([rms]))
         for rms in (0.05, 0.2)
     ]
-    made = bare_estimate(
-        PARAMETERS,
-        THETA,
-        std,
-        units=UNITS,
-        covariance=covariance(std),
-        chi2=201.0,
-        dof=198,
-        residual_rms={output: 0.05},
-        sigma={output: 0.05},
-        predicted=(predicted,),
-        recordings=(recording,),
-        nominal=(0.7 * predicted,),
-        segments=(np.array([0.0, 1.0]),),
-        whiteness=(
+    fields = {
+        "parameters": PARAMETERS,
+        "theta": THETA,
+        "std": std,
+        "units": UNITS,
+        "covariance": covariance(std),
+        "chi2": 201.0,
+        "dof": 198,
+        "residual_rms": {output: 0.05},
+        "sigma": {output: 0.05},
+        "predicted": (predicted,),
+        "recordings": (recording,),
+        "nominal": (0.7 * predicted,),
+        "segments": (np.array([0.0, 1.0]),),
+        "whiteness": (
             Whiteness(
                 output=output,
                 count=samples,
@@ -183,7 +184,7 @@ def estimate(name: str = "hinge", samples: int = 200, **changes: object) -> Esti
                 time=1.0,
             ),
         ),
-        predictions=(
+        "predictions": (
             Prediction(
                 name="logs/new.csv",
                 identified=errors[0],
@@ -194,13 +195,13 @@ def estimate(name: str = "hinge", samples: int = 200, **changes: object) -> Esti
                 nominal_outputs=0.8 * predicted,
             ),
         ),
-        labels=labels(name),
-        draws=draws(std),
-        recording_comparison=make_recording_comparison(
+        "labels": labels(name),
+        "draws": draws(std),
+        "recording_comparison": make_recording_comparison(
             PARAMETERS, UNITS, ("swing.csv", "other.csv", "third.csv")
         ),
-    )
-    return replace(made, **changes)
+    }
+    return bare_estimate(**{**fields, **changes})
 
 
 def draws(std: Array) -> ParameterDraws:
@@ -264,20 +265,18 @@ def check(parameters: tuple[str, ...] = PARAMETERS, **changes: object) -> Check:
     return replace(made, **changes)
 
 
-def comparison(parameters: tuple[str, ...] = PARAMETERS, **changes: object) -> Comparison:
+def comparison(**changes: object) -> Comparison:
     """A design that is better than one baseline, and one baseline that violates a limit."""
     rows = tuple(
-        MethodResult(
-            method=method,
+        make_method_result(
+            method,
+            cost,
             title=title,
             outcome=outcome,
             control=np.zeros((4, 1)),
-            cost=cost,
-            criterion=cost,
             std=0.01 * cost * THETA,
             min_eigenvalue=1.0 / cost,
             worst_relative_std=0.01 * cost,
-            seconds=1.0,
             steps=1000,
             margins={"position": 0.1},
             relative_margins={"position": 0.1},
@@ -288,18 +287,8 @@ def comparison(parameters: tuple[str, ...] = PARAMETERS, **changes: object) -> C
             (DESIGN, "mjfim's design", 1.0, MethodOutcome.INSIDE),
         )
     )
-    made = Comparison(
-        source="study.toml",
-        criterion="E",
-        nats=0.0,
-        parameters=parameters,
-        units=UNITS,
-        scale=THETA,
-        nuisance=(),
-        rows=rows,
-        seconds=1.0,
-        seed=0,
-        weighted=False,
+    made = make_comparison(
+        *rows, source="study.toml", parameters=PARAMETERS, units=UNITS, scale=THETA
     )
     return replace(made, **changes)
 
@@ -484,12 +473,12 @@ def worth(parameters: tuple[str, ...] = PARAMETERS, **changes: object) -> Worth:
     return replace(made, **changes)
 
 
-def watch(parameters: tuple[str, ...] = PARAMETERS, **changes: object) -> Watch:
+def watch(**changes: object) -> Watch:
     """A stream of 12 s, after which one of three parameters is known well enough."""
     t = np.linspace(0.0, 12.0, 60)
     std = np.outer(1.0 / np.sqrt(np.maximum(t, 0.1)), THETA * np.array([0.1, 0.2, 0.4]))
     made = Watch(
-        parameters=parameters,
+        parameters=PARAMETERS,
         units=UNITS,
         sizes=np.abs(THETA),
         wanted=0.05 * np.abs(THETA),
