@@ -186,20 +186,6 @@ def test_a_robust_design_is_better_at_its_samples_than_the_nominal_design(
         assert own.final.cost < 0.9 * crossed.cost
 
 
-def test_samples_are_halved_until_their_bodies_can_exist() -> None:
-    parameters, theta = unknowns(*[{"bounds": (0.0, 8.0), "guess": 1.0}] * 2), np.ones(2)
-    free = sample_parameters(parameters, theta, 9, 0)
-    drawn = sample_parameters(parameters, theta, 9, 0, lambda row: [0] if row[0] > 2.0 else [])
-    assert_array_equal(drawn[:, 1], free[:, 1])
-    assert (free[:, 0] > 2.0).sum() >= 4
-    times = np.log2((free[1:, 0] - 1.0) / (drawn[1:, 0] - 1.0))
-    assert_allclose(times, np.ceil(np.log2(np.maximum(free[1:, 0] - 1.0, 1.0))), atol=1e-9)
-    assert (drawn[:, 0] <= 2.0).all()
-
-    # Where halving does not help, samples end at the guess.
-    assert_array_equal(sample_parameters(parameters, theta, 3, 0, lambda row: [0, 1]), 1.0)
-
-
 def test_samples_of_an_inertia_are_bodies(tmp_path) -> None:
     table = {"B": {"inertial": "hull", "coordinates": "barycentric", "prior": 0.5}}
     task = body_task(tmp_path, parameters=table, robust={"samples": 8})
@@ -211,6 +197,10 @@ def test_samples_of_an_inertia_are_bodies(tmp_path) -> None:
     assert moments.min() > 0.0
     assert (2.0 * moments.max(axis=1) <= moments.sum(axis=1) * (1.0 + 1e-6)).all()
     assert len(np.unique(thetas, axis=0)) == 8
+
+    # Where halving the distance to the guess does not help, samples end there.
+    drawn = sample_parameters(task.parameters, task.theta, 3, 0, lambda row: range(len(row)))
+    assert_array_equal(drawn, [task.theta] * 3)
 
 
 @pytest.mark.slow

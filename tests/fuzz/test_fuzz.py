@@ -73,24 +73,26 @@ def test_a_hidden_feasible_motion_is_found(seed: int, tmp_path: Path) -> None:
 @pytest.mark.parametrize("seed", range(12))
 def test_random_plants_compile_with_their_ranges(make: Any, seed: int) -> None:
     plant = make(np.random.default_rng(seed))
-    model = mujoco.MjModel.from_xml_string(plant.xml)
+    spec = mujoco.MjSpec.from_string(plant.xml)
+    model = spec.compile()
     assert (model.njnt, model.nu) == (len(plant.joints), len(plant.drives))
-    read = {
-        "position": lambda name: model.joint(name).range,
-        "control": lambda name: model.actuator(name).ctrlrange,
-        "force": lambda name: model.actuator(name).forcerange,
-        "tendon_length": lambda name: model.tendon_range[model.tendon(name).id],
-        "tendon_force": lambda name: model.tendon_actfrcrange[model.tendon(name).id],
+    fields = {
+        "position": ("joint", "range"),
+        "control": ("actuator", "ctrlrange"),
+        "force": ("actuator", "forcerange"),
+        "tendon_length": ("tendon", "range"),
+        "tendon_force": ("tendon", "actfrcrange"),
     }
     balls = [joint.name for joint in plant.joints if joint.kind == "ball"]
     for (kind, name), (low, high) in plant.ranges.items():
-        if kind in read:
-            assert tuple(read[kind](name)) == (0.0 if name in balls else low, high)
+        if kind in fields:
+            holder, field = fields[kind]
+            found = getattr(getattr(spec, holder)(name), field)
+            assert tuple(found) == (0.0 if name in balls else low, high)
 
 
 def test_ranges_that_a_design_does_not_mention_are_noticed() -> None:
-    rng = np.random.default_rng(18)
-    unheld: list[str] = []
+    rng, unheld = np.random.default_rng(18), []
     while not unheld:
         mechanism = random_mechanism(rng)
         unheld = [drive.name for drive in mechanism.drives if not drive.is_held]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import scipy
+from numpy.testing import assert_allclose
 
 from mjfim.optimize.condensed_least_squares import Condensed
 from mjfim.optimize.levenberg_marquardt import step_over_curved_rows
@@ -52,3 +53,14 @@ def test_over_a_barrier_it_is_the_minimum_inside() -> None:
 
     # The linear step leaves the region.
     assert condensed.step(0.0, scale, -infinite, infinite).common[0] < -1.0
+
+    # Over straight rows it is the linear step, also within bounds.
+    rows, bound = condensed.common_rows, np.full(COUNT, 0.2)
+
+    def straight(step: Array) -> Array:
+        return np.column_stack([rows[:, :-1], rows[:, :-1] @ step + rows[:, -1]])
+
+    linear = condensed.step(1e-3, scale, -bound, bound)
+    found = step_over_curved_rows(condensed, straight, 1e-3, scale, -bound, bound)
+    for name in ("common", "private", "predicted_decrease"):
+        assert_allclose(getattr(found, name), getattr(linear, name), atol=1e-10)
