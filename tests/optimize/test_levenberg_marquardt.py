@@ -6,7 +6,7 @@ The status names the reason where the search fails.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -31,33 +31,31 @@ SHARP = SearchSettings(max_iterations=200, tolerance=1e-9)
 UNDAMPED = replace(SHARP, damped=False)
 
 
-@dataclass(eq=False)
 class Analytic:
     """Residuals of segments as functions of theta and of the private unknowns of the segment.
 
-    Derivatives are computed by complex steps.
-
-    Attributes:
-        segments: Residuals of every segment.
-        lower: (c,) lower bounds of theta.
-        upper: (c,) upper bounds of theta.
-        spoil: Changes the (k, n + c) Jacobian of a segment.
-        loss: The loss, which is linearised by weights.
-        stop: Number of the evaluation that sets the stop token.
-        token: The stop token.
-        seen: All evaluated points.
-        linearised: All points of a linearisation.
+    Derivatives are computed by complex steps. All evaluated points, and all of a linearisation, are
+    kept.
     """
 
-    segments: tuple[Rows, ...]
-    lower: Array
-    upper: Array
-    spoil: Callable[[Array], Array] = np.asarray
-    loss: RobustLoss = field(default_factory=lambda: RobustLoss(kind="linear"))
-    stop: int | None = None
-    token: StopToken = field(default_factory=StopToken)
-    seen: list[UnknownValues] = field(default_factory=list)
-    linearised: list[UnknownValues] = field(default_factory=list)
+    def __init__(
+        self,
+        *segments: Rows,
+        lower: Any = -FREE,
+        upper: Any = FREE,
+        spoil: Callable[[Array], Array] = np.asarray,
+        loss: RobustLoss | None = None,
+        stop: float = FREE,
+    ) -> None:
+        """Residuals of every segment, with bounds of theta.
+
+        `spoil` changes the (k, n + c) Jacobian of a segment. The evaluation with the number `stop`
+        sets the stop token.
+        """
+        self.segments, self.lower, self.upper = segments, np.array(lower), np.array(upper)
+        self.spoil, self.loss = spoil, loss or RobustLoss(kind="linear")
+        self.stop, self.token = stop, StopToken()
+        self.seen, self.linearised = [], []
 
     def residuals(self, at: UnknownValues) -> list[Array]:
         return [
@@ -66,7 +64,7 @@ class Analytic:
 
     def cost(self, at: UnknownValues) -> float:
         self.seen.append(at)
-        if self.stop is not None and len(self.seen) >= self.stop:
+        if len(self.seen) >= self.stop:
             self.token.request()
         with np.errstate(all="ignore"):
             half = 0.5 * sum(self.loss.value(r) for r in self.residuals(at))
@@ -100,16 +98,6 @@ class Analytic:
 
     def common_values(self, at: UnknownValues) -> Array:
         return at.theta
-
-
-def problem(
-    *segments: Rows,
-    lower: list[float] | float = -FREE,
-    upper: list[float] | float = FREE,
-    **more: Any,
-) -> Analytic:
-    """A problem with bounds of the common unknowns."""
-    return Analytic(segments, np.array(lower), np.array(upper), **more)
 
 
 def reference(p: Analytic, start: UnknownValues) -> tuple[Array, Array, float]:
@@ -193,17 +181,17 @@ def together(*theta: float) -> UnknownValues:
 
 def free_decays() -> Analytic:
     """The decays within bounds that are far away."""
-    return problem(*decays(), lower=[0.0, -5.0])
+    return Analytic(*decays(), lower=[0.0, -5.0])
 
 
 def valley(lower: Any = -5.0, upper: Any = 5.0, **more: Any) -> Analytic:
     """The valley of Rosenbrock, by default within wide bounds."""
-    return problem(rosenbrock, lower=lower, upper=upper, **more)
+    return Analytic(rosenbrock, lower=lower, upper=upper, **more)
 
 
 def peaked(**more: Any) -> Analytic:
     """The peak within wide bounds."""
-    return problem(peak, **{"lower": [0.0, -3.0, 0.1], "upper": [10.0, 3.0, 5.0], **more})
+    return Analytic(peak, **{"lower": [0.0, -3.0, 0.1], "upper": [10.0, 3.0, 5.0], **more})
 
 
 BENT = alone(-1.2, 1.0)
@@ -211,16 +199,16 @@ HIGH = alone(1.0, -0.5, 1.5)
 
 CASES = {
     "decays": (free_decays, together(0.3, 0.0)),
-    "decays without damping": (lambda: problem(*decays()), together(1.0, 0.4), UNDAMPED),
+    "decays without damping": (lambda: Analytic(*decays()), together(1.0, 0.4), UNDAMPED),
     "bounded decays": (
-        lambda: problem(*decays(), lower=[0.0, 0.35], upper=[1.2, 2.0]),
+        lambda: Analytic(*decays(), lower=[0.0, 0.35], upper=[1.2, 2.0]),
         together(0.3, 1.0),
     ),
     "valley": (valley, BENT),
     "valley without damping": (lambda: valley(-FREE, FREE), BENT, UNDAMPED),
     "walled valley": (lambda: valley(-2.0, [0.6, 5.0]), BENT),
     "valley from the wall": (lambda: valley([-2.0, 1.5], [5.0, 3.0]), alone(-2.0, 1.5)),
-    "badly scaled": (lambda: problem(powell, lower=0.0, upper=[1.0, 20.0]), alone(0.0, 1.0)),
+    "badly scaled": (lambda: Analytic(powell, lower=0.0, upper=[1.0, 20.0]), alone(0.0, 1.0)),
     "peak": (peaked, HIGH),
     "held at a wall": (
         lambda: peaked(lower=[0.0, -3.0, 1.0], upper=[1.5, 3.0, 5.0]),
@@ -261,7 +249,7 @@ def cliff(theta: Array, private: Array) -> Array:
 @pytest.mark.parametrize("settings", [SHARP, UNDAMPED])
 def test_diverging_trials_shorten_the_step(settings: SearchSettings) -> None:
     """A search that starts where the simulation diverges has no solution."""
-    p = problem(cliff, lower=[-10.0])
+    p = Analytic(cliff, lower=[-10.0])
     found = solved(p, alone(3.0), settings)
     assert any(at.theta[0] < 0.2 for at in p.seen), "no step led off the cliff"
     assert found.success
@@ -276,7 +264,7 @@ def test_a_minimum_at_a_cliff_is_not_called_converged() -> None:
         bad = np.real(theta[0]) < 1.0
         return np.where(bad, np.nan, np.array([10.0 * theta[0], 3.0 * theta[0] + 1.0]))
 
-    found = solved(problem(rows, lower=[-10.0]), alone(3.0))
+    found = solved(Analytic(rows, lower=[-10.0]), alone(3.0))
     assert 1.0 <= found.unknowns.theta[0] < 1.1
     assert not found.success
     assert "converged" not in found.status.replace("not converged", "")
@@ -327,7 +315,9 @@ def test_numerical_noise_does_not_prevent_convergence() -> None:
             ripple = np.sin(1e9 * (seed + 1) * np.sum(np.real(theta)) + np.arange(60.0))
             return peak(theta, private) * (1.0 + 1e-7 * ripple)
 
-        found = solved(problem(rough, lower=[0.0, -3.0, 0.1]), HIGH, SearchSettings(tolerance=1e-6))
+        found = solved(
+            Analytic(rough, lower=[0.0, -3.0, 0.1]), HIGH, SearchSettings(tolerance=1e-6)
+        )
         assert found.success, found.status
         assert found.cost < cost + 1e-3
         assert_allclose(found.unknowns.theta, theta, rtol=1e-3)
@@ -352,7 +342,7 @@ def test_short_first_steps_in_a_flat_valley_are_not_convergence() -> None:
             total, apart = theta[0] + theta[1], theta[0] - theta[1]
             return np.array([total - 2.0, thin * apart - 10.0])
 
-        found = solved(problem(rows), alone(1.0, 1.0), SearchSettings())
+        found = solved(Analytic(rows), alone(1.0, 1.0), SearchSettings())
         assert found.success, found.status
         assert_allclose(thin * (found.unknowns.theta @ [1.0, -1.0]), 10.0, rtol=0, atol=0.02)
 
@@ -412,7 +402,7 @@ def test_a_first_step_is_the_last_one_only_where_it_is_short(begin: float, itera
         return np.array([theta[0] ** 2, np.sqrt(10.0) + 0.0 * theta[0]])
 
     settings = SearchSettings(tolerance=1e-2, relinearise_at_end=False)
-    assert solved(problem(halving, lower=[-5.0]), alone(begin), settings).iterations == iterations
+    assert solved(Analytic(halving, lower=[-5.0]), alone(begin), settings).iterations == iterations
 
 
 @pytest.mark.parametrize(
@@ -452,7 +442,7 @@ def drifting() -> Analytic:
         )
         for i in range(0, 800, 20)
     ]
-    return problem(*parts)
+    return Analytic(*parts)
 
 
 def test_a_search_ends_where_it_cannot_beat_a_cost() -> None:
@@ -474,7 +464,7 @@ def test_longer_steps_reach_the_minimum_of_a_robust_loss_sooner() -> None:
     A = np.vander(np.linspace(-1.0, 1.0, 300), 3, increasing=True)
     y = A @ [5.0, -30.0, 20.0] + rng.standard_normal(300) + 25.0 * (rng.random(300) < 0.33)
     loss = RobustLoss(kind="soft_l1", scale=1.0)
-    plain, longer = (problem(lambda theta, private: A @ theta - y, loss=loss) for _ in range(2))
+    plain, longer = (Analytic(lambda theta, private: A @ theta - y, loss=loss) for _ in range(2))
     solved(plain, start, SearchSettings(tolerance=1e-6))
 
     # Reported costs are those of the points at which the search went on.
@@ -506,7 +496,7 @@ def test_a_step_that_is_shorter_along_a_weak_direction_is_tried() -> None:
         return np.where(np.real(difference) > 3.0, np.nan, rows)
 
     settings = SearchSettings(tolerance=1e-9, begins_near=True, max_iterations=1)
-    found = solved(problem(beside_a_cliff), alone(0.0, 0.0), settings)
+    found = solved(Analytic(beside_a_cliff), alone(0.0, 0.0), settings)
     sum_of_both, difference = found.unknowns.theta @ [[1.0, 1.0], [1.0, -1.0]]
     assert sum_of_both == pytest.approx(4.0, rel=1e-3)
 
