@@ -15,7 +15,7 @@ import typer
 
 from mjfim.parallel import cores
 from tests.fuzz.outcome import KINDS, Case, Outcome
-from tests.fuzz.workers import run_cases
+from tests.fuzz.workers import run_case, run_cases
 from tests.support.paths import ROOT
 
 
@@ -64,8 +64,6 @@ def main(
 
 def _here(cases: list[Case]) -> Iterator[Outcome]:
     """Run cases in this process, for a debugger; their files stay."""
-    from tests.fuzz.workers import run_case
-
     home = Path(tempfile.mkdtemp(prefix="mjfim-fuzz-"))
     sys.path.insert(0, str(ROOT))
     os.chdir(home)

@@ -25,9 +25,8 @@ from mjfim.output.plots import draw
 from mjfim.parallel.budget import LAST_SECONDS
 from tests.fuzz.bad_inputs import Call
 from tests.fuzz.odd_inputs import bad_input, long_log, no_permission
-from tests.fuzz.outcome import TIME_LIMITS, Case, Outcome
+from tests.fuzz.outcome import TIME_LIMITS, Case, Outcome, announce
 from tests.fuzz.result_files import PIXEL, faults_in
-from tests.fuzz.workers import announce
 from tests.support.cli import PROCESS, write_experiment
 from tests.support.cli import run as run_here
 

@@ -23,9 +23,8 @@ import psutil
 
 from mjfim.parallel.budget import NOTHING_SENTENCE
 from tests.fuzz.inputs import make_study
-from tests.fuzz.outcome import Case, Outcome
+from tests.fuzz.outcome import Case, Outcome, announce
 from tests.fuzz.result_files import faults_in
-from tests.fuzz.workers import announce
 from tests.support.cli import PROCESS, write_experiment, write_wrong_guess
 from tests.support.contents import contents
 from tests.support.paths import ROOT

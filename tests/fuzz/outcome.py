@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
@@ -19,6 +20,15 @@ TIME_LIMITS = {
 
 # Kinds of cases; the place of a kind in this list is part of the seed of its random numbers.
 KINDS = tuple(TIME_LIMITS)
+
+
+# File in the current folder of a process that describes the running case.
+RUNNING = Path("running.txt")
+
+
+def announce(description: str) -> None:
+    """Write down what the running case is, for the case of a crash."""
+    RUNNING.write_text(description, encoding="utf-8")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -15,7 +15,7 @@ from mjfim.output.archive import write_design
 from mjfim.records.design import keeps_limits
 from tests.fuzz.bad_inputs import Tables, pick
 from tests.fuzz.mechanisms import random_mechanism
-from tests.fuzz.outcome import Case, Outcome
+from tests.fuzz.outcome import Case, Outcome, announce
 from tests.fuzz.plants import Plant, Ranges, Rng, about_zero, random_plant
 from tests.fuzz.player import (
     NEAREST,
@@ -27,7 +27,6 @@ from tests.fuzz.player import (
     read_reference,
     read_rows,
 )
-from tests.fuzz.workers import announce
 
 # Time of one design [s]; the iterations end most of them before.
 SECONDS = 15.0

@@ -19,14 +19,12 @@ from pathlib import Path
 
 import psutil
 
-from tests.fuzz.outcome import TIME_LIMITS, Case, Outcome
+from tests.fuzz import inputs, kills, problems
+from tests.fuzz.outcome import RUNNING, TIME_LIMITS, Case, Outcome, announce
 from tests.support.paths import ROOT
 
 # Memory that a worker may use [bytes]; a case that wants more fails with MemoryError.
 MEMORY = 8 * 2**30
-
-# File in the current folder of a worker that describes the running case.
-RUNNING = Path("running.txt")
 
 
 def run_case(case: Case, folder: Path) -> Outcome:
@@ -36,8 +34,6 @@ def run_case(case: Case, folder: Path) -> Outcome:
         case: The case.
         folder: Empty folder for its files.
     """
-    from tests.fuzz import inputs, kills, problems
-
     begin = time.monotonic()
     runs = {
         "problem": problems.run,
@@ -132,11 +128,6 @@ class Worker:
             for each in (*process.children(recursive=True), process):
                 each.kill()
         self._executor.shutdown()
-
-
-def announce(description: str) -> None:
-    """Write down what the running case is, for the case of a crash."""
-    RUNNING.write_text(description, encoding="utf-8")
 
 
 def _begin(home: str) -> None:
