@@ -13,10 +13,7 @@ from tests.fuzz.plants import (
     TAGS,
     TIMESTEPS,
     Attributes,
-    Drive,
     Joint,
-    Plant,
-    Ranges,
     Rng,
     about_zero,
     body_text,
@@ -35,20 +32,15 @@ KINDS = ("hinge", "hinge", "hinge", "slide", "ball")
 COMPONENTS = {"ball": 3, "free": 6}
 
 
-def random_mechanism(rng: Rng) -> Plant:
-    """Make a mechanism of one to three links with the keyframe `start`."""
-    return _Builder(rng).mechanism()
+class Mechanism:
+    """A random mechanism of one to three links with the keyframe `start`.
 
-
-class _Builder:
-    """Puts a random mechanism together, one section of the MJCF after the other."""
+    It has the attributes of `Plant`, and is put together one section of the MJCF after the other.
+    """
 
     def __init__(self, rng: Rng) -> None:
         self.rng = rng
-        self.ranges: Ranges = {}
-        self.features: list[str] = []
-        self.targets: list[str] = []
-        self.drives: list[Drive] = []
+        self.ranges, self.features, self.targets, self.drives = {}, [], [], []
         self.timestep = rng.choice(TIMESTEPS)
         self.gravity = float(rng.choice([0.0, 0.0, 9.81]))
 
@@ -61,12 +53,6 @@ class _Builder:
         # Gravity compensation, which actuators provide where joints say so.
         self.is_compensated = self.gravity > 0.0 and self.chance(0.3)
 
-    def chance(self, probability: float) -> bool:
-        """True with a probability."""
-        return bool(self.rng.random() < probability)
-
-    def mechanism(self) -> Plant:
-        """Put all sections together."""
         integrator, cone = (
             str(self.rng.choice(each)) for each in (INTEGRATORS, ("pyramidal", "elliptic"))
         )
@@ -91,24 +77,18 @@ class _Builder:
             cone=cone,
             gravity=(0, 0, -self.gravity),
         )
-        return Plant(
-            xml=(
-                '<mujoco model="mechanism">\n  <compiler angle="radian" autolimits="true"/>\n'
-                f"{option}\n"
-                f'  <worldbody>\n    <site name="anchor" pos="0 0.1 0.3"/>\n{world}\n'
-                f"  </worldbody>\n  <tendon>{''.join(tendons.values())}</tendon>\n"
-                f"  <actuator>{drives}</actuator>\n  <equality>{equality}</equality>\n"
-                f"  <keyframe>{keyframe}</keyframe>\n</mujoco>\n"
-            ),
-            timestep=self.timestep,
-            joints=self.joints,
-            drives=tuple(self.drives),
-            targets=tuple(self.targets),
-            ranges=self.ranges,
-            can_rest=self.can_rest,
-            collides=self.collides,
-            features=tuple(self.features),
+        self.xml = (
+            '<mujoco model="mechanism">\n  <compiler angle="radian" autolimits="true"/>\n'
+            f"{option}\n"
+            f'  <worldbody>\n    <site name="anchor" pos="0 0.1 0.3"/>\n{world}\n'
+            f"  </worldbody>\n  <tendon>{''.join(tendons.values())}</tendon>\n"
+            f"  <actuator>{drives}</actuator>\n  <equality>{equality}</equality>\n"
+            f"  <keyframe>{keyframe}</keyframe>\n</mujoco>\n"
         )
+
+    def chance(self, probability: float) -> bool:
+        """True with a probability."""
+        return bool(self.rng.random() < probability)
 
     # Links
 

@@ -14,7 +14,7 @@ from mjfim.experiment.system import System
 from mjfim.output.archive import write_design
 from mjfim.records.design import keeps_limits
 from tests.fuzz.bad_inputs import Tables, pick
-from tests.fuzz.mechanisms import random_mechanism
+from tests.fuzz.mechanisms import Mechanism
 from tests.fuzz.outcome import Case, Outcome, announce
 from tests.fuzz.plants import Plant, Ranges, Rng, about_zero, random_plant
 from tests.fuzz.player import (
@@ -40,7 +40,7 @@ def run(case: Case, folder: Path) -> Outcome:
         folder: Empty folder for its files.
     """
     rng = case.rng
-    plant = random_plant(rng) if case.kind == "problem" else random_mechanism(rng)
+    plant = random_plant(rng) if case.kind == "problem" else Mechanism(rng)
     tables = random_tables(rng, plant)
     if case.kind == "mechanism":
         complicate(rng, plant, tables)

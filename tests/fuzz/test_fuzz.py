@@ -14,7 +14,7 @@ import pytest
 from mjfim.parallel.budget import measured_by
 from tests.fuzz import bad_inputs, inputs, problems
 from tests.fuzz.inputs import Ending
-from tests.fuzz.mechanisms import random_mechanism
+from tests.fuzz.mechanisms import Mechanism
 from tests.fuzz.odd_inputs import SPOILERS, no_permission
 from tests.fuzz.outcome import Case
 from tests.fuzz.plants import Ranges, random_plant
@@ -69,7 +69,7 @@ def test_a_hidden_feasible_motion_is_found(seed: int, tmp_path: Path) -> None:
     assert outcome.complaint == ""
 
 
-@pytest.mark.parametrize("make", [random_plant, random_mechanism])
+@pytest.mark.parametrize("make", [random_plant, Mechanism])
 @pytest.mark.parametrize("seed", range(12))
 def test_random_plants_compile_with_their_ranges(make: Any, seed: int) -> None:
     plant = make(np.random.default_rng(seed))
@@ -94,7 +94,7 @@ def test_random_plants_compile_with_their_ranges(make: Any, seed: int) -> None:
 def test_ranges_that_a_design_does_not_mention_are_noticed() -> None:
     rng, unheld = np.random.default_rng(18), []
     while not unheld:
-        mechanism = random_mechanism(rng)
+        mechanism = Mechanism(rng)
         unheld = [drive.name for drive in mechanism.drives if not drive.is_held]
     assert len(omissions(mechanism, ())) == len(unheld)
     assert omissions(mechanism, (f"ranges of {' '.join(unheld)}",)) == []
