@@ -114,18 +114,18 @@ def design(name: str = "hinge", samples: int = 50, **changes: object) -> Design:
     history = ten_iterates()
     final = evaluation(1.0, samples)
     share = 0.9 * final.trajectory.qpos[:, 0]
-    made = Design(
-        status=Status.CONVERGED,
-        parameters=PARAMETERS,
-        theta=THETA,
-        initial=evaluation(0.1, samples),
-        final=final,
-        history=history,
-        slope=1e-8,
-        steps=1000,
-        seconds=1.5,
-        limits={"position": 0.1},
-        usage=(
+    fields = {
+        "status": Status.CONVERGED,
+        "parameters": PARAMETERS,
+        "theta": THETA,
+        "initial": evaluation(0.1, samples),
+        "final": final,
+        "history": history,
+        "slope": 1e-8,
+        "steps": 1000,
+        "seconds": 1.5,
+        "limits": {"position": 0.1},
+        "usage": (
             LimitUsage(
                 kind="position",
                 name=name,
@@ -135,10 +135,10 @@ def design(name: str = "hinge", samples: int = 50, **changes: object) -> Design:
                 upper=BOUND,
             ),
         ),
-        labels=labels(name),
-        rehearsal=rehearsal(name, steps=finite_steps(predicted=final.std)),
-    )
-    return replace(made, **changes)
+        "labels": labels(name),
+        "rehearsal": rehearsal(name, steps=finite_steps(predicted=final.std)),
+    }
+    return Design(**{**fields, **changes})
 
 
 def estimate(name: str = "hinge", samples: int = 200, **changes: object) -> Estimate:
