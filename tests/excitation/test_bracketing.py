@@ -55,12 +55,6 @@ def test_the_search_ends_at_the_smallest_and_largest_allowed_number() -> None:
     assert smallest_feasible(lambda n: 2.0, 40, 100, grid, lambda n: 1) == (None, 100)
 
 
-def test_the_grid_rounds_to_multiples_from_its_first_multiple_on() -> None:
-    grid = SampleGrid(unit=4, first_multiple=200)
-    assert [grid.round_down(n) for n in (1, 7.5, 199, 200, 203, 204)] == [2, 7, 199, 200, 200, 204]
-    assert [grid.round_up(n) for n in (1, 7.5, 199, 200, 201)] == [2, 8, 199, 200, 204]
-
-
 def test_a_stopped_search_returns_the_bracket_so_far() -> None:
     """An evaluation gives no ratio where the user stops it."""
     grid = SampleGrid(unit=1, first_multiple=0)

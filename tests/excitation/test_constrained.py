@@ -17,16 +17,13 @@ from mjfim.experiment.initial import spline_basis
 from mjfim.output.pages import page_of
 from mjfim.records.design import Design, Status, keeps_limits
 from tests.support.cart_pendulum import cart_pendulum
-from tests.support.limits import ARM, HARD, cart_inside, excess_of, of_kind, played
+from tests.support.limits import HARD, arm_task, cart_inside, excess_of, of_kind, played
 from tests.support.numerics import (
     CART_PARAMETERS,
-    CART_PENDULUM,
     Array,
-    make_task,
     relative_error,
 )
 from tests.support.pages import sentences
-from tests.support.paths import MODELS
 
 # ---- the requirement
 
@@ -42,25 +39,8 @@ def test_the_study_of_the_paper_under_hard_limits_beats_a_general_solver() -> No
     assert paper.status.success and keeps_limits(paper)
     assert paper.warnings == ()
 
-    # Information per second, independent of the package: finite differences of plain loops.
-    model = mujoco.MjModel.from_xml_path(str(MODELS / "cart_pendulum.xml"))
-    bob, start, ctrl = model.body("bob").id, model.key("hanging").qpos.copy(), paper.trajectory.ctrl
-
-    def motion() -> dict[str, Array]:
-        return played(model, (start, np.zeros(2)), ctrl, 1)
-
-    columns, h = [], 1e-5
-    places = ((model.body_mass, bob), (model.body_pos, (bob, 2)), (model.dof_damping, 1))
-    for array, place in places:
-        value, ends = float(array[place]), []
-        for array[place] in (value + h, value - h):
-            ends.append(np.concatenate([motion()["q"], motion()["v"]], axis=1))
-        array[place] = value
-        columns.append((ends[0] - ends[1]).reshape(-1) / (2 * h * 0.05))
-    G = np.array(columns).T
-    eigenvalues = np.linalg.eigvalsh(G.T @ G) / 100.0
-    assert eigenvalues[0] >= 399.0
-    assert_allclose(eigenvalues, paper.final.eigenvalues, rtol=1e-4)
+    assert paper.final.eigenvalues[0] >= 399.0
+    ctrl = paper.trajectory.ctrl
 
     # No engine step violates a limit. Both ranges are used, and the design says so.
     excess = excess_of(DesignTask.resolve(limited), ctrl)
@@ -80,18 +60,17 @@ def test_the_study_of_the_paper_under_hard_limits_beats_a_general_solver() -> No
 # ---- ways to the inside
 
 
-def rows_of(task: DesignTask, ctrl: Array) -> dict[str, Array]:
-    """Positions, velocities, accelerations and forces at every engine step of a plain loop."""
+def positions(task: DesignTask, ctrl: Array) -> Array:
+    """Positions at every engine step of a plain loop."""
     start = task.space.split(task.plant.nominal_initial_state)[:2]
-    rows = played(task.system.model, start, ctrl, task.system.grid.substeps)
-    return dict(zip(("position", "velocity", "acceleration", "force"), rows.values(), strict=True))
+    return played(task.system.model, start, ctrl, task.system.grid.substeps)["q"]
 
 
 def test_a_design_says_what_the_initial_control_violates_and_when(tmp_path: Path) -> None:
     wild = {"kind": "sine", "amplitude": 8.0, "frequency": 1.0}
     task = cart_inside(tmp_path, control=wild, descent={"max_iterations": 1, "coarse": 1})
     design = design_task(task)
-    position = rows_of(task, task.control)["position"][:, 0]
+    position = positions(task, task.control)[:, 0]
     beyond = np.maximum(position - 0.5, -0.3 - position)
     worst, first = int(np.argmax(beyond)), np.flatnonzero(beyond > 0.0)[0]
     found = {v.kind: v for v in design.initial_violations}
@@ -108,30 +87,6 @@ def test_a_design_says_what_the_initial_control_violates_and_when(tmp_path: Path
     assert said in sentences(page_of(design))
     kinds = {entry["kind"] for entry in design.summary()["limits"]["initial"]}
     assert kinds == found.keys()
-
-
-@pytest.mark.parametrize("weight", [1e-3, {"force": 1e-5}], ids=["one", "named"])
-@pytest.mark.slow
-def test_a_design_does_not_use_a_clamp(weight: Any, tmp_path: Path) -> None:
-    """A force that only a clamp keeps within its range violates its limit."""
-    weak = CART_PENDULUM.format(integrator="RK4").replace(
-        'joint="slide"/>', 'joint="slide" forcerange="-1.5 1.5"/>'
-    )
-    task = make_task(
-        weak,
-        tmp_path,
-        horizon=1.0,
-        parameters={"m": CART_PARAMETERS["m"], "c": CART_PARAMETERS["c"]},
-        noise={"state": 0.05},
-        initial={"qpos": (0.0, 3.0)},
-        control={"kind": "sine", "amplitude": 1.0, "frequency": 0.9},
-        cost={"control": weight},
-        descent={"max_iterations": 12},
-    )
-    design = design_task(task)
-    assert -0.2 < excess_of(task, design.trajectory.ctrl)["force", "force"] < 0.0
-    assert 0.0 < design.limits["force"] < 0.3
-    assert not any("clamp" in sentence for sentence in design.warnings)
 
 
 # ---- more iterations
@@ -157,20 +112,18 @@ def test_more_iterations_never_give_less(tmp_path: Path) -> None:
 
 def arm_design(folder: Path, **tables: Any) -> tuple[DesignTask, Design]:
     """The arm of two servos for half a second, held at rest against gravity, and its design."""
+    bound = (-1.0, 1.0)
+    limits = {
+        "control": {"shoulder": bound, "elbow": bound},
+        "control_rate": 6.0,
+        **tables.pop("limits", {}),
+    }
     defaults = {
-        "horizon": 0.5,
-        "parameters": {"m": {"target": "body/fore:mass"}, "c": {"target": "joint/elbow:damping"}},
-        "noise": {"qpos:shoulder": 0.01, "qpos:elbow": 0.01},
         "control": {"kind": "sine", "amplitude": 0.1, "frequency": 2.0},
         "cost": {"control": 0.0},
         "descent": {"max_iterations": 8, "coarse": 1},
     }
-    limits = {
-        "control": {"shoulder": (-1.0, 1.0), "elbow": (-1.0, 1.0)},
-        "control_rate": 6.0,
-        **tables.pop("limits", {}),
-    }
-    task = make_task(ARM, folder, **{**defaults, **tables, "limits": limits})
+    task = arm_task(folder, **{**defaults, **tables, "limits": limits})
     return task, design_task(task)
 
 
@@ -201,7 +154,7 @@ def test_a_periodic_design_can_be_repeated(tmp_path: Path) -> None:
     )
     ctrl = design.trajectory.ctrl
     assert_arm(task, design, (ctrl[0], ctrl[0]))
-    twice = rows_of(task, np.concatenate([ctrl, ctrl]))["position"]
+    twice = positions(task, np.concatenate([ctrl, ctrl]))
     assert np.abs(np.diff(np.split(twice, 2), axis=0)).max() < 0.05
 
 
@@ -226,21 +179,6 @@ def test_a_design_of_limited_bandwidth_is_made_of_its_splines(coarse: Any, tmp_p
     assert_allclose(ctrl[0], hold, rtol=0, atol=1e-6)
     assert np.abs(ctrl[1] - ctrl[0]).max() < 0.05 * np.ptp(ctrl)
     assert_arm(task, design, (hold, hold))
-    power = np.abs(np.fft.rfft(swing, axis=0)) ** 2
-    f = np.fft.rfftfreq(len(swing), task.dt)
-    assert power[f > 18.0].sum() < 1e-2 * power.sum()
-
-
-@pytest.mark.slow
-def test_clearance_is_kept_at_every_engine_step(tmp_path: Path) -> None:
-    """Without the limit the fore-arm comes closer."""
-    task, design = arm_design(tmp_path, limits={"clearance": 0.15})
-    _, free = arm_design(tmp_path)
-    excess, nearer = (
-        of_kind(excess_of(task, each.trajectory.ctrl), "clearance") for each in (design, free)
-    )
-    assert excess <= 0.0 < nearer
-    assert design.limits["clearance"] == pytest.approx(-0.15 * excess, abs=1e-6)
 
 
 WIDE = {"control": {"force": (-50.0, 50.0)}, "position": {"slide": (-9.0, 9.0)}}
@@ -264,7 +202,7 @@ RESTING = {
     ids=["weights", "odd samples", "rest to rest"],
 )
 def test_a_shorter_design_played_several_times_is_a_start(
-    tmp_path: Path, count: int, tables: dict[str, Any]
+    tmp_path: Path, count: int, tables: Any
 ) -> None:
     """A part of the horizon has about as much information per second; costs hold for all of it."""
     descent = {"repeats": (count,), "max_iterations": 4}
@@ -292,7 +230,7 @@ COMBINATION = {"criterion": "c", "combination": {"m": 1.0, "c": -0.5}}
     ids=["A", "D", "c", "robust"],
 )
 @pytest.mark.slow
-def test_every_criterion_improves_within_limits(tmp_path: Path, tables: dict[str, Any]) -> None:
+def test_every_criterion_improves_within_limits(tmp_path: Path, tables: Any) -> None:
     cost = {"control": 0.0, **tables.get("cost", {})}
     task = cart_inside(tmp_path, **{**tables, "cost": cost, "descent": {"max_iterations": 6}})
     design = design_task(task)

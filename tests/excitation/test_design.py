@@ -68,20 +68,14 @@ def test_saturation_is_reported(
     short: Experiment, design_of_short: mjfim.Design, tmp_path: Path
 ) -> None:
     """Enforced limits keep a design off the clamp: it acts only where they are not enforced."""
-    checked = short.replace(descent={"max_iterations": 8}, limits={"enforce": False})
+    limits = {"control": {"force": [-1.0, 1.0]}, "enforce": False}
+    checked = short.replace(descent={"max_iterations": 8}, limits=limits)
     weak = altered(tmp_path, checked, 'forcelimited="true" forcerange="-1.5 1.5"')
-    assert any("forcerange clamps force" in sentence for sentence in mjfim.design(weak).warnings)
-    assert not any("forcerange" in sentence for sentence in design_of_short.warnings)
-
-
-def test_violated_limits_are_reported_and_are_no_success(short: Experiment) -> None:
-    # limits are enforced by default; here they are only checked
-    tight = short.replace(limits={"control": {"force": [-1.0, 1.0]}, "enforce": False})
-    design = mjfim.design(tight)
-    assert design.limits["control"] < 0
-    assert design.status.success
-    assert not keeps_limits(design)
-    assert any("control limits are exceeded" in sentence for sentence in design.warnings)
+    design = mjfim.design(weak)
+    assert design.limits["control"] < 0.0 and not keeps_limits(design)
+    for words in ("forcerange clamps force", "control limits are exceeded"):
+        assert any(words in sentence for sentence in design.warnings)
+        assert not any(words in sentence for sentence in design_of_short.warnings)
 
 
 def test_a_given_initial_control_is_checked_and_is_the_start(
@@ -122,13 +116,6 @@ def test_the_criterion_becomes_smooth_where_the_smallest_eigenvalues_meet(tmp_pa
     assert made.final.cost == pytest.approx(1.0 / first + running, rel=1e-9)
     fine = [row.cost for row in made.history if row.rate == 100.0]
     assert made.final.cost == pytest.approx(min(fine), rel=1e-12)
-    # no small change of the control has a much lower cost
-    rng, here = np.random.default_rng(0), made.trajectory.ctrl
-    for _ in range(10):
-        wave = np.sin(2 * np.pi * rng.uniform(0.5, 4.0) * task.t + rng.uniform(0.0, 6.3))[:, None]
-        for size in (-0.3, 0.3):
-            moved = task.problem.point(task.plant.simulate(task.theta, here + size * wave))
-            assert moved.cost > 0.99 * made.final.cost
 
 
 @pytest.mark.slow

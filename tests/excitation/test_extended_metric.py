@@ -66,13 +66,13 @@ CASES = {
 def test_without_weight_on_psi_the_extended_direction_is_that_of_metric_descent(
     case: str, tmp_path
 ) -> None:
-    _, plain, wide = directions(CASES[case](tmp_path), 0.0)
-    assert relative_error(wide.v, plain.v) < 5e-6  # the accuracy of the mixed differences of both
+    """With a weight on psi, it is another descent direction."""
+    task = CASES[case](tmp_path)
+    _, plain, wide = directions(task, 0.0)
+    # The accuracy of the mixed differences of both.
+    assert relative_error(wide.v, plain.v) < 5e-6
     assert relative_error(wide.z, plain.z) < 5e-6
-
-
-def test_with_weight_on_psi_the_extended_direction_is_another_descent_direction(tmp_path) -> None:
-    expansion, plain, wide = directions(CASES["cart E"](tmp_path), 1.0)
+    expansion, plain, wide = directions(task, 1.0)
     assert relative_error(wide.v, plain.v) > 1e-2
     assert expansion.slope(wide) < 0.0
 

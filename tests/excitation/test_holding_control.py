@@ -66,7 +66,7 @@ def test_a_contact_that_a_longer_timestep_softens_holds_the_start_all_the_same(
         rate=50.0,
         horizon=1.0,
         initial={"qpos": data.qpos.tolist(), "control": {"kind": "constant", "amplitude": 1.0}},
-        parameters={"mass": {"target": "body/box:mass"}},
+        parameters={"mass": "body/box:mass"},
         noise={"state": 0.01},
         boundary={"start": "rest", "velocity": 1e-3},
     )
@@ -93,7 +93,7 @@ def test_a_hold_at_the_end_of_a_range_is_inside_it_up_to_rounding(tmp_path: Path
         rate=50.0,
         horizon=1.0,
         initial={"qpos": [angle, angle], "control": {"kind": "constant", "amplitude": 0.0}},
-        parameters={"mass": {"target": "body/a:mass"}},
+        parameters={"mass": "body/a:mass"},
         noise={"state": 0.01},
         boundary={"start": "rest"},
     )

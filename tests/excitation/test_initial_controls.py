@@ -13,8 +13,7 @@ from mjfim.errors import ExperimentError, RecordingError
 from mjfim.excitation.initial_controls import initial_controls_of
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.initial import fourier_basis
-from tests.support.limits import ARM
-from tests.support.numerics import make_task
+from tests.support.limits import arm_task
 
 SWING = {
     "kind": "sine",
@@ -22,19 +21,12 @@ SWING = {
     "offset": 0.2,
     "frequency": 1.0,
 }
-RANGE = {"shoulder": (-0.35, 0.3)}
+LIMITS = {"control": {"shoulder": (-0.35, 0.3)}}
 
 
 def arm(folder: Path, **tables: Any) -> DesignTask:
     """The arm for a second."""
-    defaults = {
-        "horizon": 1.0,
-        "parameters": {"m": {"target": "body/fore:mass"}},
-        "noise": {"qpos:elbow": 0.01},
-        "control": SWING,
-        "limits": {"control": RANGE},
-    }
-    return make_task(ARM, folder, **{**defaults, **tables})
+    return arm_task(folder, **{"horizon": 1.0, "control": SWING, "limits": LIMITS, **tables})
 
 
 def test_the_given_control_takes_the_place_of_the_initial_one(tmp_path: Path) -> None:
@@ -88,7 +80,7 @@ def test_a_fourier_series_comes_with_its_basis(begins: bool, ends: bool, tmp_pat
     """It has fifteen harmonics, or those below the bandwidth."""
     boundary = {"start": "rest" if begins else "given", "end": "rest" if ends else "free"}
     for bandwidth, harmonics in ((None, 15), (7.0, 4)):
-        limits = {"control": RANGE, **({"bandwidth": bandwidth} if bandwidth else {})}
+        limits = {**LIMITS, **({"bandwidth": bandwidth} if bandwidth else {})}
         task = arm(tmp_path, boundary=boundary, limits=limits, descent={"fourier": (1.5,)})
         series = list(initial_controls_of(task, None))[1].curves
         assert series is not None
@@ -96,9 +88,7 @@ def test_a_fourier_series_comes_with_its_basis(begins: bool, ends: bool, tmp_pat
 
 
 @pytest.mark.parametrize(("limits", "most"), [({}, 50), ({"bandwidth": 5.0}, 5)])
-def test_a_series_without_any_harmonic_is_refused(
-    limits: dict[str, float], most: int, tmp_path: Path
-) -> None:
+def test_a_series_without_any_harmonic_is_refused(limits: Any, most: int, tmp_path: Path) -> None:
     task = arm(tmp_path, limits=limits, descent={"fourier": (60.0,)})
     message = rf"descent\.fourier: 60 Hz is above the bandwidth of {most} Hz"
     with pytest.raises(ExperimentError, match=message):
@@ -125,7 +115,7 @@ def test_an_earlier_design_is_repeated_until_the_horizon_ends(tmp_path: Path) ->
 def test_a_repeated_control_is_the_first_part_of_the_initial_one_faded_to_rest(
     tmp_path: Path,
 ) -> None:
-    boundary, limits = {"start": "rest", "end": "rest"}, {"control": RANGE, "control_rate": 5.0}
+    boundary, limits = {"start": "rest", "end": "rest"}, {**LIMITS, "control_rate": 5.0}
     task = arm(tmp_path, boundary=boundary, limits=limits, descent={"repeats": (2, 4)})
     half, quarter = list(initial_controls_of(task, None))[1:]
     assert (half.name, half.repeats, len(half.control)) == ("2 times a design of 0.5 s", 2, 50)
@@ -147,7 +137,7 @@ def test_a_repeated_control_is_the_first_part_of_the_initial_one_faded_to_rest(
     ],
 )
 def test_repeats_that_do_not_divide_or_lack_limits_are_refused(
-    tables: dict[str, Any], message: str, tmp_path: Path
+    tables: Any, message: str, tmp_path: Path
 ) -> None:
     with pytest.raises(ExperimentError, match=rf"descent\.repeats{message}"):
         initial_controls_of(arm(tmp_path, **tables), None)

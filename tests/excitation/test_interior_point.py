@@ -14,8 +14,8 @@ from mjfim.excitation.limits.constraints import constraint_set_of
 from mjfim.excitation.search.interior_problem import DIVERGED_POINT, InteriorProblem, values_of
 from mjfim.excitation.task import DesignTask
 from mjfim.optimize.projection_operator import Expansion
-from tests.support.limits import along_control, directions_of
-from tests.support.numerics import cart_task, directional_check
+from tests.support.limits import along_control, directions_of, slope_check
+from tests.support.numerics import Array, cart_task
 
 LIMITS = {
     "control": {"force": (-5.0, 4.5)},
@@ -55,18 +55,33 @@ def check(
 ) -> float:
     """Largest relative error of the slope of the problem's value along random controls."""
     gradient = expansion.gradient(np.zeros((task.samples, 1, task.space.nx)))
-    ways = directions_of(task, 4)
-    curves = [
-        lambda s, way=way: problem.value(problem.point(task.control + s * way)) for way in ways
-    ]
-    return directional_check([float(np.sum(gradient * way)) for way in ways], curves, h)
+
+    def value(ctrl: Array) -> float:
+        return problem.value(problem.point(ctrl))
+
+    return slope_check(task, gradient, value, directions_of(task, 4), h)
 
 
 @pytest.mark.parametrize("name", COSTS)
-def test_the_slope_agrees_with_simulated_controls(name: str, tmp_path: Path) -> None:
+def test_the_value_is_stated_and_its_slope_agrees_with_simulated_controls(
+    name: str, tmp_path: Path
+) -> None:
     """With the barrier, whose expansion is also given separately, and without it."""
     task, problem = problem_of(name, tmp_path)
     point = problem.point(task.control)
+    J = task.problem.point(task.initial).cost
+    if name == "smooth E":
+        assert point.point.cost > J  # at most p^(1/q) above it
+        J = point.point.cost
+    # The merit is log J; for D-optimality it is J over the number of parameters and the weight.
+    weight = 3.0 if "heavier" in name else 1.0
+    expected = J / (3 * weight) if "D" in name else np.log(J)
+    assert point.merit == pytest.approx(expected, rel=1e-4)
+    values = along_control(task, problem.constraints)
+    assert point.barrier == pytest.approx(problem.constraints.value(values, 0.05), rel=1e-12)
+    assert problem.value(point) == pytest.approx(point.merit + 0.2 * point.barrier, rel=1e-12)
+    assert problem.size(point) == 1.0
+
     expansion = problem.expand(point)
     assert check(task, problem, expansion) < 5e-3
     barrier = expansion.barrier
@@ -74,24 +89,6 @@ def test_the_slope_agrees_with_simulated_controls(name: str, tmp_path: Path) -> 
     assert check(task, replace(problem, mu=0.0), alone) < 5e-3
     twice = replace(problem, mu=0.4).expand(point).barrier
     assert_allclose(twice.b, 2.0 * barrier.b, rtol=1e-12)
-
-
-@pytest.mark.parametrize("name", COSTS)
-def test_a_point_holds_the_cost_and_the_barrier(name: str, tmp_path: Path) -> None:
-    """The merit is log J; for D-optimality it is J over the number of parameters and the weight."""
-    task, problem = problem_of(name, tmp_path)
-    point = problem.point(task.control)
-    J = task.problem.point(task.initial).cost
-    if name == "smooth E":
-        assert point.point.cost > J  # at most p^(1/q) above it
-        J = point.point.cost
-    expected = np.log(J) if "D" not in name else J / (3 * (3.0 if "heavier" in name else 1.0))
-    assert point.merit == pytest.approx(expected, rel=1e-4)
-    values = along_control(task, problem.constraints)
-    assert point.barrier == pytest.approx(problem.constraints.value(values, 0.05), rel=1e-12)
-    assert problem.value(point) == pytest.approx(point.merit + 0.2 * point.barrier, rel=1e-12)
-    assert problem.size(point) == 1.0
-    assert_array_equal(point.ctrl, task.control)
 
 
 def test_a_reevaluated_point_equals_that_of_the_new_problem(tmp_path: Path) -> None:

@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.testing import assert_allclose
 
 from mjfim.excitation.objective import DesignPoint
 from mjfim.excitation.search.levels import DescentLevel
@@ -49,7 +48,7 @@ def furuta(folder: Path) -> DesignTask:
     """The Qube, implicitfast, 20 steps per sample, neither limits nor contacts."""
     parameters = {
         "arm": {"target": "joint/theta:damping", "guess": 1e-3},
-        "gear": {"target": "actuator/motor:gear"},
+        "gear": "actuator/motor:gear",
     }
     control = {"kind": "sine", "amplitude": 5e-3, "frequency": 1.5}
     initial = {"qpos": (0.1, 0.3), "control": control}
@@ -66,18 +65,14 @@ def cart(integrator: str = "RK4", **tables: Any) -> Callable[[Path], DesignTask]
 
 def servo(folder: Path) -> DesignTask:
     """Cart under a position servo whose gain and damping are unknown but not wanted."""
-    motor, position = (
-        '<motor name="force" joint="slide"/>',
-        '<position name="force" joint="slide" kp="30" kv="4"/>',
-    )
-    xml = CART_PENDULUM.format(integrator="implicitfast")
-    assert motor in xml
+    motor, position = "<motor", '<position kp="30" kv="4"'
+    xml = CART_PENDULUM.format(integrator="implicitfast").replace(motor, position)
     unwanted = {
         n: {"target": f"actuator/force:{n}", "nuisance": True, "prior": 2.0} for n in ("kp", "kv")
     }
     control = {"kind": "sine", "amplitude": 0.3, "frequency": 1.2}
     return make_task(
-        xml.replace(motor, position),
+        xml,
         folder,
         parameters={**CART_PARAMETERS, **unwanted},
         noise={"angle": 0.01, "rate": 0.05, "drive": 0.1},
@@ -245,7 +240,7 @@ def test_the_gradient_is_that_of_J_through_the_projection(
         assert relative_error(slopes, np.array(measured)) < accuracy
 
 
-def test_running_cost_and_its_gradient_are_the_stated_sum(tmp_path) -> None:
+def test_the_running_cost_is_the_stated_sum(tmp_path) -> None:
     task = cart_task(tmp_path, cost=TRACKING)
     running, rng = task.problem.running, np.random.default_rng(4)
     curve = task.plant.simulate(task.theta, task.control + rng.normal(size=task.control.shape))
@@ -254,24 +249,16 @@ def test_running_cost_and_its_gradient_are_the_stated_sum(tmp_path) -> None:
     total = 0.5 * np.sum(Q * away**2) + 0.5e-4 * np.sum(curve.ctrl**2)
     assert running.value(curve) == pytest.approx(total, rel=1e-12)
     assert running.value(task.initial) == pytest.approx(0.5e-4 * np.sum(task.control**2), rel=1e-12)
-    a, b = running.gradient(curve)
-    assert_allclose(a, [np.zeros(4), *(away * Q)], rtol=1e-12)
-    assert_allclose(b, 1e-4 * curve.ctrl, rtol=1e-12)
 
 
-@pytest.mark.parametrize("criterion", ["E", "A", "D"])
-def test_the_size_of_J_is_J_or_of_D_optimality_one_nat_per_parameter(
-    criterion: str, tmp_path
-) -> None:
-    task = cart_task(tmp_path, cost={**TRACKING, "criterion": criterion, "information": 0.3})
-    point = task.problem.point(task.initial)
-    if criterion == "D":
-        assert task.problem.size(point) == pytest.approx(
-            0.3 * 3 + task.problem.running.value(task.initial)
-        )
-        assert point.cost < 0.0
-    else:
-        assert task.problem.size(point) == point.cost > 0.0
+def test_the_size_of_J_of_D_optimality_is_one_nat_per_parameter(tmp_path) -> None:
+    for criterion in "EAD":
+        task = cart_task(tmp_path, cost={**TRACKING, "criterion": criterion, "information": 0.3})
+        point = task.problem.point(task.initial)
+        of_d = 0.3 * 3 + task.problem.running.value(task.initial)
+        wanted = of_d if criterion == "D" else point.cost
+        assert task.problem.size(point) == pytest.approx(wanted)
+        assert (point.cost < 0.0) is (criterion == "D")
 
 
 def test_a_diverged_trial_has_infinite_cost_and_no_expansion(tmp_path) -> None:

@@ -22,7 +22,7 @@ from tests.support.numerics import CART_PARAMETERS, Array, cart_task
 def information(seed: int, size: int) -> Array:
     """A well-conditioned information matrix."""
     root = np.random.default_rng(seed).standard_normal((2 * size, size))
-    return np.asarray(root.T @ root)
+    return root.T @ root
 
 
 def design_file(path: Path, names: list[str], matrix: Array, prior: Array | None = None) -> Path:
@@ -33,54 +33,48 @@ def design_file(path: Path, names: list[str], matrix: Array, prior: Array | None
     return path
 
 
-def test_designs_and_estimates_add_up_by_name(tmp_path: Path) -> None:
-    """The names may be in any order."""
-    first, second = information(0, 2), information(1, 2)
-    design = design_file(tmp_path / "design.json", ["b", "a"], first)
-    estimate = design_file(tmp_path / "estimate.json", ["c", "a"], second)
-    wanted = np.zeros((3, 3))
-    wanted[np.ix_([1, 0], [1, 0])] += first
-    wanted[np.ix_([2, 0], [2, 0])] += second
-    assert_allclose(known_from([design, estimate], ("a", "b", "c"))[0], wanted, rtol=1e-12)
-    assert not known_from([], ("a", "b"))[0].any()
-
-
 def marginal(matrix: Array, kept: list[int]) -> Array:
     """Information about some parameters where the others are unknown."""
-    return np.asarray(np.linalg.inv(np.linalg.inv(matrix)[np.ix_(kept, kept)]))
+    return np.linalg.inv(np.linalg.inv(matrix)[np.ix_(kept, kept)])
 
 
-def test_further_parameters_of_a_file_are_marginalised(tmp_path: Path) -> None:
-    """The covariance of the shared parameters is that of the file, with unknown other ones."""
-    matrix = information(2, 4)
-    path = design_file(tmp_path / "design.json", ["x", "a", "y", "b"], matrix)
-    assert_allclose(known_from([path], ("a", "b"))[0], marginal(matrix, [1, 3]), rtol=1e-11)
+TWO, THREE, FOUR = (information(size, size) for size in (2, 3, 4))
+SUM = np.array([[4.0, 4.0, 0.0], [4.0, 4.0, 0.0], [0.0, 0.0, 9.0]])
+OWN, OF_X = np.diag([5.0, 0.0, 7.0]), np.diag([0.0, 0.0, 7.0])
+START = ["a", "initial qpos:slide", "bias acc"]
+OF_START = np.diag([0.0, 100.0, 0.0])
+APART = np.zeros((3, 3))
+APART[::2, ::2] = marginal(THREE + OF_START, [0, 2])
+
+# The parameters of a file, its information with its prior, the prior, the parameters of the next
+# experiment, and what is known about them.
+KNOWN = {
+    "other order": (["b", "a"], TWO, None, ["a", "b"], TWO[::-1, ::-1]),
+    # The covariance of the shared parameters is that of the file, with unknown other ones.
+    "further parameters": (["x", "a", "y", "b"], FOUR, None, ["a", "b"], marginal(FOUR, [1, 3])),
+    # Only the sum of a and x is known, so that nothing is known about a.
+    "confounded": (["a", "x", "b"], SUM, None, ["a", "b"], np.diag([0.0, 9.0])),
+    # A prior would be counted again with every file; those of marginalised parameters stay.
+    "prior": (["a", "b", "x"], THREE + OWN, OWN, ["a", "b", "x"], THREE),
+    "prior of another": (
+        ["a", "b", "x"],
+        THREE + OWN,
+        OWN,
+        ["a", "b"],
+        marginal(THREE + OF_X, [0, 1]),
+    ),
+    # Deviations of the initial state differ between experiments; biases of sensors are common.
+    "initial state": (START, THREE + OF_START, OF_START, START, APART),
+}
 
 
-def test_nothing_is_known_about_a_parameter_that_is_confounded_with_others(tmp_path: Path) -> None:
-    """Only the sum of a and x is known, so that nothing is known about a."""
-    matrix = np.array([[4.0, 4.0, 0.0], [4.0, 4.0, 0.0], [0.0, 0.0, 9.0]])
-    path = design_file(tmp_path / "design.json", ["a", "x", "b"], matrix)
-    assert_allclose(known_from([path], ("a", "b"))[0], np.diag([0.0, 9.0]), atol=1e-12)
-
-
-def test_the_prior_of_a_file_is_left_out(tmp_path: Path) -> None:
-    """It would be counted again with every file; priors of marginalised parameters stay."""
-    data, prior = information(3, 3), np.diag([5.0, 0.0, 7.0])
-    path = design_file(tmp_path / "design.json", ["a", "b", "x"], data + prior, prior)
-    assert_allclose(known_from([path], ("a", "b", "x"))[0], data, rtol=1e-12)
-    joint = data + np.diag([0.0, 0.0, 7.0])
-    assert_allclose(known_from([path], ("a", "b"))[0], marginal(joint, [0, 1]), rtol=1e-11)
-
-
-def test_deviations_of_the_initial_state_belong_to_one_experiment(tmp_path: Path) -> None:
-    """Their values differ between experiments; sensor biases are common to all experiments."""
-    names = ["a", "initial qpos:slide", "bias acc"]
-    data, prior = information(4, 3), np.diag([0.0, 100.0, 0.0])
-    path = design_file(tmp_path / "design.json", names, data + prior, prior)
-    found = known_from([path], tuple(names))[0]
-    assert not found[1].any() and not found[:, 1].any()
-    assert_allclose(found[::2, ::2], marginal(data + prior, [0, 2]), rtol=1e-11)
+@pytest.mark.parametrize("case", KNOWN)
+def test_what_a_file_knows_is_found_by_name(case: str, tmp_path: Path) -> None:
+    names, matrix, prior, asked, wanted = KNOWN[case]
+    path = design_file(tmp_path / "design.json", names, matrix, prior)
+    assert_allclose(known_from([path], tuple(asked))[0], wanted, rtol=1e-11, atol=1e-12)
+    assert_allclose(known_from([path, path], tuple(asked))[0], 2.0 * wanted, rtol=1e-11, atol=1e-12)
+    assert not known_from([], tuple(asked))[0].any()
 
 
 def estimate_file(path: Path, names: list[str], honest: list[float | None], **more: object) -> Path:
@@ -101,7 +95,7 @@ def test_estimates_tell_how_much_wider_honest_deviations_are(tmp_path: Path) -> 
     _, inflation, sigma = known_from([first, second], ("a", "b", "c", "d"))
     logs = np.log([np.sqrt((30.0**2 + 40.0**2) / 2.0), 2.0, 1.0])
     # The variance of the logarithm of a standard deviation of four normal values, by its theory.
-    chance = float(polygamma(1, 1.5)) / 4.0
+    chance = polygamma(1, 1.5) / 4.0
     kept = 1.0 - chance / np.var(logs)
     wanted = np.exp(logs.mean() + kept * (logs - logs.mean()))
     assert_allclose(inflation[[0, 1, 3]], wanted, rtol=2e-3)
@@ -143,6 +137,7 @@ def test_what_a_model_lacks_does_not_average_out(tmp_path: Path) -> None:
 
 
 FAULTS = {
+    "no file": (None, "cannot read: No such file"),
     "not JSON": ("{", "not a JSON file"),
     "a list": ("[1, 2]", "not a JSON object"),
     "no parameters": ('{"data": [[1.0]], "prior": [[0.0]]}', "neither a design.json nor"),
@@ -164,15 +159,10 @@ def test_unusable_files_are_named(name: str, tmp_path: Path) -> None:
     """The message names the file and the fault."""
     text, message = FAULTS[name]
     path = tmp_path / "odd.json"
-    path.write_text(text, encoding="utf-8")
+    if text is not None:
+        path.write_text(text, encoding="utf-8")
     with pytest.raises(ExperimentError, match=rf"earlier: .*odd\.json: .*{message}"):
         known_from([path], ("a", "b"))[0]
-
-
-def test_missing_files_are_named(tmp_path: Path) -> None:
-    for path, fault in ((tmp_path / "gone.json", "No such file"), (tmp_path, "Is a directory")):
-        with pytest.raises(ExperimentError, match=f"{path.name}: cannot read: {fault}"):
-            known_from([path], ("a",))[0]
 
 
 def test_a_design_that_was_written_is_read_back(tmp_path: Path) -> None:

@@ -115,7 +115,7 @@ def test_the_ranges_of_the_model_narrow_those_of_the_release(tmp_path: Path) -> 
         ({}, r"no actuators.*initial\.free.*\"qpos:hinge\" = "),
     ],
 )
-def test_faults_are_named(free: dict[str, Any], message: str, tmp_path: Path) -> None:
+def test_faults_are_named(free: Any, message: str, tmp_path: Path) -> None:
     with pytest.raises(ExperimentError, match=message):
         mjfim.design(short(tmp_path, initial={"free": free}))
 
@@ -156,7 +156,7 @@ def test_rotations_of_a_free_body_are_relative_to_the_stated_state(tmp_path: Pat
             "qpos": (0.0, 0.0, 1.0, 0.0, 1.0, 0.0, 0.0),
             "free": {"qpos:base.z": (1.0, 3.0), "qpos:base.rx": (-0.5, 0.5), "qvel:base.x": (0, 1)},
         },
-        parameters={"mass": {"target": "body/b:mass"}},
+        parameters={"mass": "body/b:mass"},
         noise={"state": 0.01},
         directory=tmp_path,
     )
@@ -196,7 +196,7 @@ def test_a_recording_begins_where_the_design_does(tmp_path: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("nuisance", [{}, {"initial": {"qpos:hinge": True}}])
 def test_recordings_from_several_releases_are_identified_together(
-    nuisance: dict[str, Any], tmp_path: Path
+    nuisance: Any, tmp_path: Path
 ) -> None:
     true = {"damping": {"true": 0.013}, "centre": {"true": -0.28}}
     tables = {"horizon": 1.0, "nuisance": nuisance, "fit": {"bootstrap": 0}}

@@ -26,7 +26,7 @@ from mjfim.parallel.budget import StopToken
 from mjfim.records.design import Status
 from mjfim.records.events import DesignEvent, StudyEvent
 from tests.support.cart_pendulum import cart_pendulum
-from tests.support.cli import read, run
+from tests.support.cli import read, run, write_experiment
 from tests.support.paths import MODELS
 
 STUDY = cart_pendulum(
@@ -74,12 +74,9 @@ def test_it_reaches_every_target(shorter: mjfim.ShortestExperiment) -> None:
     assert 0.8 * shorter.horizon < seconds.max() <= shorter.horizon
     assert f"Every wanted σ is reached after {seconds.max():.3g} s" in when_learnt(shorter.design)
 
-
-@pytest.mark.slow
-def test_an_experiment_shorter_by_the_tolerance_does_not(shorter: mjfim.ShortestExperiment) -> None:
-    """Checked by a separate design from the initial control."""
+    # One that is shorter by the tolerance misses a target, by a separate design.
     below = shorter.missed
-    assert below is not None and 0.0 < shorter.horizon - below.horizon <= shorter.tolerance + 1e-9
+    assert 0.0 < shorter.horizon - below.horizon <= shorter.tolerance + 1e-9
     less = round(shorter.horizon - shorter.tolerance, 6)
     assert worst(shorter.experiment.replace(horizon=less)) > 1.0
     assert below.ratio > 1.0 and f"{below.horizon:g} s" in str(shorter)
@@ -98,14 +95,6 @@ def test_the_horizon_may_become_longer_than_stated(shorter: mjfim.ShortestExperi
 
 
 @pytest.mark.slow
-def test_the_message_names_targets_out_of_reach_with_numbers() -> None:
-    hard = wanting({"m": 1e-3, "l": 0.02, "c": 0.0125}, horizon=0.6)
-    message = r"0\.8 s is too short: the target is missed by m \(σ 0\.\d+, wanted 0\.001\)"
-    with pytest.raises(OutOfReachError, match=message):
-        mjfim.shortest_experiment(hard, longest=0.8)
-
-
-@pytest.mark.slow
 def test_it_is_saved_and_loaded_with_its_experiment(
     shorter: mjfim.ShortestExperiment, tmp_path: Path
 ) -> None:
@@ -116,11 +105,6 @@ def test_it_is_saved_and_loaded_with_its_experiment(
     assert loaded.summary() == shorter.summary()
     assert_array_equal(loaded.design.trajectory.ctrl, shorter.design.trajectory.ctrl)
 
-
-@pytest.mark.slow
-def test_an_experiment_with_a_function_cannot_be_saved(
-    shorter: mjfim.ShortestExperiment, tmp_path: Path
-) -> None:
     function = {"m": {"function": lambda spec, value: None, "guess": 1.0}}
     values = shorter.experiment.model_dump(exclude_unset=True)
     stated = shorter.experiment.restated({**values, "parameters": function})
@@ -143,7 +127,8 @@ def test_the_default_longest_horizon_is_that_of_the_table(tmp_path: Path) -> Non
         descent={"starts": 1, "max_iterations": 2},
         rehearsal={"robots": 4},
     )
-    with pytest.raises(OutOfReachError, match=r"even 0\.6 s"):
+    message = r"even 0\.6 s is too short: the target is missed by m \(σ .*, wanted 0\.0001\)"
+    with pytest.raises(OutOfReachError, match=message):
         mjfim.shortest_experiment(hard)
 
 
@@ -220,19 +205,10 @@ def test_control_of_another_duration(tmp_path: Path) -> None:
 @pytest.mark.usefixtures("empty_figures")
 def test_the_command_line(tmp_path: Path) -> None:
     """The design of the shortest horizon is written; exit code 1 where no horizon is enough."""
-    for name in ("cart_pendulum.xml", "cart_pendulum.csv"):
-        shutil.copy(MODELS / name, tmp_path)
-    text = (MODELS / "cart_pendulum.toml").read_text(encoding="utf-8")
-    text = f"rehearsal.robots = 1\n{text}"
-    for old, new in (
-        ("horizon = 4.0", "horizon = 1.0"),
-        ("max_iterations = 200", "max_iterations = 10"),
-        ("tolerance = 1e-7", "tolerance = 1e-2"),
-        ("[parameters.m] ", "[parameters.m]\nWANTED\n#"),
-    ):
-        assert old in text
-        text = text.replace(old, new, 1)
-    study, folder = tmp_path / "study.toml", tmp_path / "out"
+    study = write_experiment(tmp_path, tolerance="1e-2", max_iterations="10")
+    text = study.read_text(encoding="utf-8")
+    folder, old = tmp_path / "out", "[parameters.m] "
+    assert old in text
 
     # The table of the initial control ends after one second, which is the longest horizon then.
     table = (tmp_path / "cart_pendulum.csv").read_text(encoding="utf-8").splitlines()
@@ -243,7 +219,7 @@ def test_the_command_line(tmp_path: Path) -> None:
         ("", 2, "wanted"),
         ("wanted = 0.03", 0, "shortest horizon: "),
     ):
-        study.write_text(text.replace("WANTED", wanted), encoding="utf-8")
+        study.write_text(text.replace(old, f"[parameters.m]\n{wanted}\n#"), encoding="utf-8")
         done = run("design", study, "-o", folder, "--shortest")
         assert done.exit_code == code, done.output
         assert said in done.output

@@ -21,6 +21,11 @@ import scipy.io
 
 Rng = np.random.Generator
 Key = tuple[Any, ...]
+Rows = list[list[str]]
+Tables = dict[str, Any]
+
+# What was spoiled, in words, and whether nothing but a refusal is right.
+Spoiled = tuple[str, bool]
 
 # Calls of verbs with the files of the study.
 CHECK = ("check", "study.toml", "--threads", "1")
@@ -40,7 +45,7 @@ WRITING_VERBS = (
 )
 
 # Numbers that no key expects.
-EXTREMES: tuple[Any, ...] = (
+EXTREMES = (
     1e300,
     -1e300,
     5e-324,
@@ -58,10 +63,10 @@ EXTREMES: tuple[Any, ...] = (
 )
 
 # Values of a type that a number does not have.
-WRONG_TYPES: tuple[Any, ...] = ("text", "", "1.0", True, [], [1.0], ["x"], {}, {"x": 1.0})
+WRONG_TYPES = ("text", "", "1.0", True, [], [1.0], ["x"], {}, {"x": 1.0})
 
 # A long text and a long list, a list inside a list and so on, and a large table.
-HUGE: tuple[Any, ...] = (
+HUGE = (
     "x" * 100_000,
     [0.5] * 20_000,
     functools.reduce(lambda inner, _: [inner], range(200), []),
@@ -72,7 +77,7 @@ HUGE: tuple[Any, ...] = (
 TABLES_BY_NAME = ("parameters", "noise", "position", "velocity", "control", "tracking", "columns")
 
 # Tables that the study of the paper does not state, so that their keys are spoiled too.
-FURTHER_TABLES: dict[str, dict[str, Any]] = {
+FURTHER_TABLES = {
     "limits": {
         "position": {"slide": [-2.0, 2.0]},
         "velocity": 30.0,
@@ -221,14 +226,14 @@ def spoiled_experiment(rng: Rng, folder: Path) -> Call:
     return Call(words=words, spoiled=f"experiment: {spoiled}", refused=refused)
 
 
-def _remove(rng: Rng, tables: dict[str, Any]) -> tuple[str, bool]:
+def _remove(rng: Rng, tables: Tables) -> Spoiled:
     """Remove a key."""
     path = pick(rng, leaves(tables))
     del at(tables, path[:-1])[path[-1]]
     return f"{path} removed", path in (("model",), ("rate",), ("parameters",))
 
 
-def _rename(rng: Rng, tables: dict[str, Any]) -> tuple[str, bool]:
+def _rename(rng: Rng, tables: Tables) -> Spoiled:
     """Rename a key."""
     path = pick(rng, [p for p in leaves(tables) if isinstance(p[-1], str)])
     table = at(tables, path[:-1])
@@ -238,7 +243,7 @@ def _rename(rng: Rng, tables: dict[str, Any]) -> tuple[str, bool]:
     return f"{path} renamed to {new[:20]!r}", not by_name and new != path[-1]
 
 
-def _replace(rng: Rng, tables: dict[str, Any]) -> tuple[str, bool]:
+def _replace(rng: Rng, tables: Tables) -> Spoiled:
     """Replace a number by an extreme one, or a value by one of another type or a huge one."""
     values = pick(rng, (EXTREMES, EXTREMES, WRONG_TYPES, WRONG_TYPES, HUGE))
     paths = leaves(tables)
@@ -301,7 +306,7 @@ def spoiled_model(rng: Rng, folder: Path) -> Call:
     return Call(words=words, spoiled=f"{file.name}: {spoiled}", refused=refused or is_urdf)
 
 
-def _set_attribute(rng: Rng, tree: ElementTree.Element) -> tuple[str, bool]:
+def _set_attribute(rng: Rng, tree: ElementTree.Element) -> Spoiled:
     """Give an attribute a bad value, or remove it."""
     element = pick(rng, [e for e in tree.iter() if e.attrib])
     name = pick(rng, sorted(element.attrib))
@@ -313,7 +318,7 @@ def _set_attribute(rng: Rng, tree: ElementTree.Element) -> tuple[str, bool]:
     return f"{element.tag} {name}={value!r}", value == "nan" and name in MOVING
 
 
-def _change_element(rng: Rng, tree: ElementTree.Element) -> tuple[str, bool]:
+def _change_element(rng: Rng, tree: ElementTree.Element) -> Spoiled:
     """Remove, double, rename or multiply an element, or nest it deeply."""
     parents = [e for e in tree.iter() if len(e)]
     parent = pick(rng, parents)
@@ -372,13 +377,13 @@ def spoiled_recording(rng: Rng, folder: Path) -> Call:
     return Call(words=words, spoiled=spoiled, refused=refused, accepted=accepted)
 
 
-def rows_of(folder: Path) -> list[list[str]]:
+def rows_of(folder: Path) -> Rows:
     """The header and the rows of the recording of the study."""
     lines = (folder / "run.csv").read_text(encoding="utf-8").splitlines()
     return [[cell.strip('"') for cell in line.split(",")] for line in lines]
 
 
-def in_format(name: str, rows: list[list[str]]) -> bytes:
+def in_format(name: str, rows: Rows) -> bytes:
     """A table in the format of a file name."""
     text = "\n".join(",".join(row) for row in rows) + "\n"
     if name.endswith(".csv"):
@@ -416,7 +421,7 @@ def _column(cells: list[str]) -> list[Any]:
         return cells
 
 
-def _ragged(rng: Rng, rows: list[list[str]]) -> tuple[str, bool]:
+def _ragged(rng: Rng, rows: Rows) -> Spoiled:
     """Make a row longer or shorter."""
     i = int(rng.integers(1, len(rows)))
     if rng.random() < 0.5:
@@ -426,7 +431,7 @@ def _ragged(rng: Rng, rows: list[list[str]]) -> tuple[str, bool]:
     return f"row {i} has {len(rows[i])} fields", True
 
 
-def _bad_cell(rng: Rng, rows: list[list[str]]) -> tuple[str, bool]:
+def _bad_cell(rng: Rng, rows: Rows) -> Spoiled:
     """Spoil one field."""
     i, j = int(rng.integers(1, len(rows))), int(rng.integers(len(rows[0])))
     values = ("nan", "", "text", "1e300", "-1e300", "inf", "1,5", "1 2", "=1+1", "9" * 5000)
@@ -435,7 +440,7 @@ def _bad_cell(rng: Rng, rows: list[list[str]]) -> tuple[str, bool]:
     return f"row {i}, column {rows[0][j]}: {rows[i][j][:20]!r}", refused
 
 
-def _columns(rng: Rng, rows: list[list[str]]) -> tuple[str, bool]:
+def _columns(rng: Rng, rows: Rows) -> Spoiled:
     """Remove, double, rename or swap columns."""
     j = int(rng.integers(len(rows[0])))
     title = rows[0][j]
@@ -458,7 +463,7 @@ def _columns(rng: Rng, rows: list[list[str]]) -> tuple[str, bool]:
     return f"column {title} {name}", refused
 
 
-def odd_times(rng: Rng, rows: list[list[str]]) -> tuple[str, bool]:
+def odd_times(rng: Rng, rows: Rows) -> Spoiled:
     """Spoil the times."""
     times = [float(row[0]) for row in rows[1:]]
     changed = {
@@ -477,13 +482,13 @@ def odd_times(rng: Rng, rows: list[list[str]]) -> tuple[str, bool]:
     return f"times {name}", name in ("equal", "text")
 
 
-def few_rows(rng: Rng, rows: list[list[str]]) -> tuple[str, bool]:
+def few_rows(rng: Rng, rows: Rows) -> Spoiled:
     count = int(rng.integers(4))
     del rows[1 + count :]
     return f"{count} rows", count < 2
 
 
-def _booleans(rng: Rng, rows: list[list[str]]) -> tuple[str, bool]:
+def _booleans(rng: Rng, rows: Rows) -> Spoiled:
     """Make a column one of truth values."""
     j = int(rng.integers(1, len(rows[0])))
     for row in rows[1:]:
@@ -492,7 +497,7 @@ def _booleans(rng: Rng, rows: list[list[str]]) -> tuple[str, bool]:
     return f"column {rows[0][j]} of truth values", not rows[0][j].startswith("ctrl:")
 
 
-def odd_numbers(rng: Rng, rows: list[list[str]]) -> tuple[str, bool]:
+def odd_numbers(rng: Rng, rows: Rows) -> Spoiled:
     """Write an odd number into some rows of a column or of all columns."""
     count = len(rows[0])
     columns = [int(rng.integers(count))] if rng.random() < 0.7 else list(range(count))
@@ -523,12 +528,12 @@ def spoiled_design(rng: Rng, folder: Path) -> Call:
     return Call(words=words, spoiled=f"design: {spoiled}", refused=refused)
 
 
-def _spoil_array(rng: Rng, file: Path) -> tuple[str, bool]:
+def _spoil_array(rng: Rng, file: Path) -> Spoiled:
     with np.load(file, allow_pickle=False) as loaded:
         arrays = {name: loaded[name] for name in loaded.files}
     name = pick(rng, ["t", "qpos", "qvel", "ctrl", *sorted(arrays)])
     array = arrays[name]
-    changes: dict[str, Any] = {
+    changes = {
         "shorter": array[:-1] if array.ndim else array,
         "flat": array.ravel()[:1],
         "NaN": np.full(array.shape, np.nan),

@@ -18,14 +18,15 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+import pytest
+
 from mjfim.files import replacing
 from mjfim.output.plots import draw
 from mjfim.parallel.budget import LAST_SECONDS
 from tests.fuzz.bad_inputs import Call
 from tests.fuzz.odd_inputs import bad_input, long_log, no_permission
-from tests.fuzz.outcome import TIME_LIMITS, Case, Outcome
-from tests.fuzz.result_files import PIXEL, faults_of, is_temporary
-from tests.fuzz.workers import announce
+from tests.fuzz.outcome import TIME_LIMITS, Case, Outcome, announce
+from tests.fuzz.result_files import PIXEL, faults_in
 from tests.support.cli import PROCESS, write_experiment
 from tests.support.cli import run as run_here
 
@@ -122,16 +123,11 @@ def _save_pixel(figure: object, path: Path, dpi: float = 0.0) -> Path:
 
 def in_this_process(call: Call, folder: Path) -> Ending:
     """Call the command line in this process, with figures of one pixel."""
-    home, save = Path.cwd(), draw.save
-    os.chdir(folder)
-    draw.save = _save_pixel
-    try:
-        with warnings.catch_warnings(record=True) as warned:
-            warnings.simplefilter("always")
-            result = run_here(*call.words)
-    finally:
-        draw.save = save
-        os.chdir(home)
+    with pytest.MonkeyPatch.context() as patch, warnings.catch_warnings(record=True) as warned:
+        patch.chdir(folder)
+        patch.setattr(draw, "save", _save_pixel)
+        warnings.simplefilter("always")
+        result = run_here(*call.words)
 
     fault = "; ".join(
         f"{w.category.__name__}: {w.message} ({w.filename}:{w.lineno})" for w in warned
@@ -259,10 +255,4 @@ def changes(folder: Path, before: dict[Path, bytes]) -> list[str]:
         for path, content in before.items()
         if not path.is_file() or path.read_bytes() != content
     ]
-    for path in folder.rglob("*"):
-        if not path.is_file() or path in before:
-            continue
-        found += faults_of(path)
-        if is_temporary(path):
-            found.append(f"{path.name} is a temporary file that stayed")
-    return found
+    return found + faults_in(set(folder.rglob("*")) - set(before))

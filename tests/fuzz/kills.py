@@ -13,22 +13,23 @@ import os
 import shutil
 import signal
 import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import psutil
+
 from mjfim.parallel.budget import NOTHING_SENTENCE
 from tests.fuzz.inputs import make_study
-from tests.fuzz.outcome import Case, Outcome
-from tests.fuzz.result_files import faults_of, is_temporary
-from tests.fuzz.workers import announce
+from tests.fuzz.outcome import Case, Outcome, announce
+from tests.fuzz.result_files import faults_in
 from tests.support.cli import PROCESS, write_experiment, write_wrong_guess
 from tests.support.contents import contents
-from tests.support.paths import ROOT, SCRIPTS
+from tests.support.paths import ROOT
+
+Process = subprocess.Popen[bytes]
 
 # Hard limits of a study.
 LIMITS = "[limits]\nposition = { slide = [-1.0, 1.0] }\ncontrol = { force = [-5.0, 5.0] }\n"
@@ -46,76 +47,33 @@ START_OF_PYTHON = 1.0
 LONGEST_CALL = 120.0
 
 
-@dataclass(frozen=True, kw_only=True)
-class Call:
-    """A call that is killed.
+# Calls of `mjfim` that are killed.
+CALLS = (
+    "check study.toml -o out",
+    "design study.toml -o out",
+    "design limited.toml -o out",
+    "design wanted.toml --shortest -o out",
+    "simulate study.toml design.npz -o out/made.csv",
+    "identify study.toml run.csv -o out",
+    "montecarlo study.toml design.npz -o out --trials 40",
+    "rehearse made -o out --robots 3",
+    "campaign guess.toml -o out --wanted 0.0055 --seed 5",
+    "replay made --save out/view.rrd",
+)
 
-    Attributes:
-        words: Its words, without the program.
-        again: Words that are added when it is repeated after a kill.
-        has_workers: Whether it has worker processes.
-        script: File of scripts/ that is called instead of `mjfim`; empty for a verb.
-    """
-
-    words: tuple[str, ...]
-    again: tuple[str, ...] = ()
-    has_workers: bool = False
-    script: str = ""
-
-    def command(self, *, again: bool = False) -> list[str]:
-        """The command line of the call, or of its repetition."""
-        program = [sys.executable, str(SCRIPTS / self.script)] if self.script else PROCESS
-        return [*program, *self.words, *(self.again if again else ())]
-
-
-FOLDER = ("-o", OUTPUT)
-CALLS = {
-    "check": Call(words=("check", "study.toml", *FOLDER)),
-    "design": Call(words=("design", "study.toml", *FOLDER)),
-    "design in a pool": Call(words=("design", "limited.toml", *FOLDER), has_workers=True),
-    "design --shortest": Call(words=("design", "wanted.toml", "--shortest", *FOLDER)),
-    "simulate": Call(words=("simulate", "study.toml", "design.npz", "-o", f"{OUTPUT}/made.csv")),
-    "identify": Call(words=("identify", "study.toml", "run.csv", *FOLDER)),
-    "montecarlo": Call(words=("montecarlo", "study.toml", "design.npz", *FOLDER, "--trials", "40")),
-    "rehearse": Call(words=("rehearse", "made", *FOLDER, "--robots", "3")),
-    "campaign": Call(
-        words=("campaign", "guess.toml", *FOLDER, "--wanted", "0.0055", "--seed", "5"),
-        again=("--resume",),
-    ),
-    "replay --save": Call(words=("replay", "made", "--save", f"{OUTPUT}/view.rrd")),
-    "identify_offline.py": Call(
-        words=("study.toml", f"{OUTPUT}/run.csv"), script="identify_offline.py"
-    ),
-}
-
-
-@dataclass(frozen=True, kw_only=True)
-class Reference:
-    """What a call does that nobody disturbs.
-
-    Attributes:
-        seconds: Its duration [s].
-        code: Its exit code.
-        files: Contents of its results by name.
-    """
-
-    seconds: float
-    code: int
-    files: dict[str, Any]
+# Those with worker processes, and what is added to a call when it is repeated after a kill.
+WITH_WORKERS = CALLS[2:3]
+AGAIN = {CALLS[8]: " --resume"}
 
 
 def prepare(folder: Path) -> None:
     """Copy the inputs of all calls into an empty folder."""
     shutil.copytree(valid_study(), folder, dirs_exist_ok=True)
-
-    # The script writes beside the recording.
     (folder / OUTPUT).mkdir()
-    shutil.copy(folder / "run.csv", folder / OUTPUT)
 
 
-def environment() -> dict[str, str]:
-    """Variables of the calls, which find the package wherever they run."""
-    return {**os.environ, "PYTHONPATH": str(ROOT)}
+# The calls find the package wherever they run.
+ENVIRONMENT = {**os.environ, "PYTHONPATH": str(ROOT)}
 
 
 def results_of(folder: Path) -> dict[str, Any]:
@@ -124,12 +82,12 @@ def results_of(folder: Path) -> dict[str, Any]:
     return {name: value for name, value in found.items() if Path(name).name not in BOOKKEEPING}
 
 
-def completed(command: list[str], folder: Path) -> subprocess.CompletedProcess[str]:
+def completed(call: str, folder: Path) -> subprocess.CompletedProcess[str]:
     """A call in a folder that has ended by itself."""
     return subprocess.run(
-        command,
+        [*PROCESS, *call.split()],
         cwd=folder,
-        env=environment(),
+        env=ENVIRONMENT,
         stdin=subprocess.DEVNULL,
         capture_output=True,
         text=True,
@@ -139,17 +97,17 @@ def completed(command: list[str], folder: Path) -> subprocess.CompletedProcess[s
 
 
 @functools.cache
-def reference(name: str) -> Reference:
-    """Carry out a call without a kill."""
+def reference(call: str) -> tuple[float, int, dict[str, Any]]:
+    """Duration [s], exit code and results of a call that nobody disturbs."""
     with tempfile.TemporaryDirectory(dir=Path.cwd()) as place:
         folder = Path(place)
         prepare(folder)
         begin = time.monotonic()
-        done = completed(CALLS[name].command(), folder)
+        done = completed(call, folder)
         seconds = time.monotonic() - begin
         if done.returncode not in (0, 1) or "Traceback" in done.stderr:
-            raise RuntimeError(f"{name} fails without a kill: {done.stderr[-2000:]}")
-        return Reference(seconds=seconds, code=done.returncode, files=results_of(folder))
+            raise RuntimeError(f"{call} fails without a kill: {done.stderr[-2000:]}")
+        return seconds, done.returncode, results_of(folder)
 
 
 @functools.cache
@@ -210,100 +168,63 @@ KILLS = (
 )
 
 
-@dataclass(frozen=True, kw_only=True)
-class Kill:
-    """What is random in a case.
-
-    Attributes:
-        name: Name of the call.
-        signals: Names of the signals.
-        share: Time of the first signal, relative to the time of the undisturbed call.
-        gap: Time between two signals [s].
-        is_deaf: Whether the call ignores SIGINT from its begin, as a background job of a shell.
-    """
-
-    name: str
-    signals: tuple[str, ...]
-    share: float
-    gap: float
-    is_deaf: bool
-
-    @classmethod
-    def of(cls, case: Case) -> Kill:
-        """The kill of a case."""
-        rng = case.rng
-        signals = KILLS[rng.integers(len(KILLS))]
-        names = [name for name, call in CALLS.items() if call.has_workers or signals != (WORKER,)]
-        return cls(
-            name=names[rng.integers(len(names))],
-            signals=signals,
-            share=LATEST * float(rng.random()),
-            gap=LONGEST_GAP * float(rng.random()),
-            is_deaf=bool(rng.integers(2)),
-        )
-
-    @property
-    def heard(self) -> tuple[str, ...]:
-        """The signals to which the call reacts."""
-        return tuple(name for name in self.signals if not (self.is_deaf and name == "SIGINT"))
-
-    def __str__(self) -> str:
-        later = f" and {self.signals[1]} {self.gap:.2f} s later" if len(self.signals) > 1 else ""
-        deaf = ", SIGINT ignored" if self.is_deaf else ""
-        return f"{self.name}, {self.signals[0]} after {100 * self.share:.0f} %{later}{deaf}"
-
-    @property
-    def group(self) -> str:
-        """Name of the kind of kill for the counts."""
-        return "+".join(self.signals) + (" deaf" if self.is_deaf else "")
-
-
 def run(case: Case, folder: Path) -> Outcome:
     """Start a call, kill it after a random time, look at what is left, and repeat the call."""
-    kill = Kill.of(case)
-    announce(str(kill))
+    rng = case.rng
+    signals = KILLS[rng.integers(len(KILLS))]
+    call = str(rng.choice(WITH_WORKERS if signals == (WORKER,) else CALLS))
+    share, gap = LATEST * float(rng.random()), LONGEST_GAP * float(rng.random())
+    # Half of the calls ignore SIGINT from their begin, as a background job of a shell.
+    is_deaf = bool(rng.integers(2))
+    heard = tuple(each for each in signals if not (is_deaf and each == "SIGINT"))
+    group = "+".join(signals) + " deaf" * is_deaf
+    description = f"{call}, {group} after {100 * share:.0f} %, {gap:.2f} s between signals"
+    announce(description)
     if os.name != "posix":
-        return Outcome(case=case, group="skipped", description=f"{kill}: not on this system")
+        reason = f"{description}: not on this system"
+        return Outcome(case=case, group="skipped", description=reason)
 
-    call, undisturbed = CALLS[kill.name], reference(kill.name)
+    duration, _, wanted = reference(call)
     prepare(folder)
-    seconds = kill.share * undisturbed.seconds
-    with _started(call, folder, is_deaf=kill.is_deaf) as process:
-        is_killed = _send(process, kill, seconds)
-        complaints = [*_ending(process, kill, seconds), *_orphans(process.pid)]
+    seconds = share * duration
+    can_hear = seconds >= START_OF_PYTHON
+    with _started(call, folder, is_deaf=is_deaf) as process:
+        is_killed = _send(process, signals, seconds, gap)
+        complaints = [*_ending(process, heard, can_hear), *_orphans(process.pid)]
 
-    told = _told(folder)
-    starts = _start(call, undisturbed)
-    if "Traceback" in told and seconds >= starts:
+    told = (folder / "stderr").read_text(encoding="utf-8", errors="replace")
+    if "Traceback" in told and can_hear:
         complaints.append("Traceback: " + "\n".join(told.splitlines()[-4:]))
-    complaints += _files(folder / OUTPUT, has_ended_itself="SIGKILL" not in kill.signals)
-    if not kill.heard or kill.heard == (WORKER,):
-        complaints += _differences(folder, undisturbed)
-    elif "SIGKILL" not in kill.heard and seconds >= starts:
+    results = (folder / OUTPUT).rglob("*")
+    # Only SIGKILL leaves no time to remove a temporary file.
+    complaints += faults_in(results, may_be_temporary="SIGKILL" in signals)
+    if not heard or heard == (WORKER,):
+        complaints += _differences(folder, wanted)
+    elif "SIGKILL" not in heard and can_hear:
         complaints += _lost(folder, told)
-    complaints += [f"again: {fault}" for fault in _again(call, folder, undisturbed)]
+    complaints += [f"again: {fault}" for fault in _again(call, folder)]
     return Outcome(
         case=case,
-        group=kill.group if is_killed else "ended before",
-        description=f"{kill} = {seconds:.2f} s",
+        group=group if is_killed else "ended before",
+        description=f"{description} = {seconds:.2f} s",
         complaint="; ".join(complaints),
     )
 
 
 @contextlib.contextmanager
-def _started(call: Call, folder: Path, *, is_deaf: bool) -> Iterator[subprocess.Popen[bytes]]:
+def _started(call: str, folder: Path, *, is_deaf: bool) -> Iterator[Process]:
     """Start a call in a session of its own; end everything that it has started at the end.
 
     In a new session, the children are recognised by their process group.
     """
     with (folder / "stderr").open("wb") as errors:
         process = subprocess.Popen(
-            call.command(),
+            [*PROCESS, *call.split()],
             cwd=folder,
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
             stderr=errors,
-            env=environment(),
+            env=ENVIRONMENT,
             start_new_session=True,
             preexec_fn=lambda: signal.signal(
                 signal.SIGINT, signal.SIG_IGN if is_deaf else signal.SIG_DFL
@@ -317,34 +238,21 @@ def _started(call: Call, folder: Path, *, is_deaf: bool) -> Iterator[subprocess.
         process.wait()
 
 
-def _told(folder: Path) -> str:
-    """What a call wrote on stderr."""
-    return (folder / "stderr").read_text(encoding="utf-8", errors="replace")
-
-
-def _start(call: Call, undisturbed: Reference) -> float:
-    """Time in which a call cannot handle a signal yet [s].
-
-    A script begins with the imports of all that it needs.
-    """
-    return 0.8 * undisturbed.seconds if call.script else START_OF_PYTHON
-
-
-def _send(process: subprocess.Popen[bytes], kill: Kill, seconds: float) -> bool:
+def _send(process: Process, signals: tuple[str, ...], seconds: float, gap: float) -> bool:
     """Send all signals; False if the process has ended before the first one."""
     if not _runs_on(process, seconds):
         return False
-    if kill.signals == (WORKER,):
+    if signals == (WORKER,):
         return _kill_worker(process)
 
-    process.send_signal(signal.Signals[kill.signals[0]])
-    for name in kill.signals[1:]:
-        if _runs_on(process, kill.gap):
+    process.send_signal(signal.Signals[signals[0]])
+    for name in signals[1:]:
+        if _runs_on(process, gap):
             process.send_signal(signal.Signals[name])
     return True
 
 
-def _runs_on(process: subprocess.Popen[bytes], seconds: float) -> bool:
+def _runs_on(process: Process, seconds: float) -> bool:
     """Wait, and return whether a process is still running after some seconds."""
     try:
         process.wait(seconds)
@@ -353,44 +261,32 @@ def _runs_on(process: subprocess.Popen[bytes], seconds: float) -> bool:
     return False
 
 
-def _kill_worker(process: subprocess.Popen[bytes]) -> bool:
+def _kill_worker(process: Process) -> bool:
     """Kill the first worker of a process that there is; False if the process ends before."""
     while process.poll() is None:
-        rows = _table("pid=,ppid=,stat=,args=")
-        own = [row for row in rows if row[1] == str(process.pid) and not row[2].startswith("Z")]
-        workers = [int(row[0]) for row in own if "spawn_main" in row[3]]
-        if workers:
-            with contextlib.suppress(ProcessLookupError):
-                os.kill(workers[-1], signal.SIGKILL)
-            return True
+        with contextlib.suppress(psutil.NoSuchProcess):
+            children = psutil.Process(process.pid).children()
+            workers = [each for each in children if "spawn_main" in " ".join(each.cmdline())]
+            if workers:
+                workers[-1].kill()
+                return True
         time.sleep(0.05)
     return False
 
 
-def _table(columns: str) -> list[list[str]]:
-    """Columns of all processes; the last column may hold blanks."""
-    listing = subprocess.run(
-        ["ps", "-A", "-ww", "-o", columns], capture_output=True, text=True, check=True
-    ).stdout
-    count = columns.count("=")
-    rows = [line.split(None, count - 1) for line in listing.splitlines()]
-    return [row for row in rows if len(row) == count]
-
-
-def _ending(process: subprocess.Popen[bytes], kill: Kill, seconds: float) -> list[str]:
-    """Describe what is wrong with the end of a process that got signals after some seconds."""
-    limit = END_TIME if len(kill.heard) == 1 else SECOND_END_TIME
-    limit = LONGEST_CALL if not kill.heard or kill.heard == (WORKER,) else limit
+def _ending(process: Process, heard: tuple[str, ...], can_hear: bool) -> list[str]:
+    """Describe what is wrong with the end of a process that heard some signals."""
+    limit = END_TIME if len(heard) == 1 else SECOND_END_TIME
+    limit = LONGEST_CALL if not heard or heard == (WORKER,) else limit
     try:
         code = process.wait(limit)
     except subprocess.TimeoutExpired:
-        return [f"no end {limit:g} s after {kill.signals[-1]}"]
+        return [f"no end {limit:g} s after the last signal"]
 
     # Python itself cannot handle a signal while it starts.
-    is_fatal = seconds < _start(CALLS[kill.name], reference(kill.name))
-    fatal = [name for name in kill.heard if name == "SIGKILL" or (is_fatal and name != WORKER)]
+    fatal = [each for each in heard if each == "SIGKILL" or not (can_hear or each == WORKER)]
     allowed = (0, 1, *(-signal.Signals[name] for name in fatal))
-    return [] if code in allowed else [f"exit code {code} after {kill.group}"]
+    return [] if code in allowed else [f"exit code {code}"]
 
 
 def _orphans(group: int) -> list[str]:
@@ -405,58 +301,38 @@ def _orphans(group: int) -> list[str]:
 
 def _alive(group: int) -> list[str]:
     """The commands of the processes of a group; ended ones that nobody has waited for count not."""
-    rows = _table("pgid=,stat=,args=")
-    return [row[-1][:100] for row in rows if row[0] == str(group) and not row[1].startswith("Z")]
-
-
-def _files(folder: Path, *, has_ended_itself: bool) -> list[str]:
-    """Describe the files that are not whole, and temporary files that should have been removed."""
-    found: list[str] = []
-    for path in sorted(folder.rglob("*")):
-        if not path.is_file():
-            continue
-        # Only SIGKILL leaves no time to remove a temporary file.
-        if not is_temporary(path):
-            found += faults_of(path)
-        elif has_ended_itself:
-            found.append(f"{path.name} is a temporary file that stayed")
+    found = []
+    for process in psutil.process_iter():
+        with contextlib.suppress(psutil.NoSuchProcess, ProcessLookupError):
+            if os.getpgid(process.pid) == group and process.status() != psutil.STATUS_ZOMBIE:
+                found.append(" ".join(process.cmdline())[:100])
     return found
 
 
-def _again(call: Call, folder: Path, undisturbed: Reference) -> list[str]:
+def _again(call: str, folder: Path) -> list[str]:
     """Repeat a call, and describe in what it differs from one that nobody disturbed."""
+    _, code, wanted = reference(call)
     try:
-        done = completed(call.command(again=True), folder)
+        done = completed(call + AGAIN.get(call, ""), folder)
     except subprocess.TimeoutExpired:
         return [f"no end after {LONGEST_CALL:g} s"]
 
-    if done.returncode != undisturbed.code:
-        code, wanted = done.returncode, undisturbed.code
-        return [f"exit code {code} instead of {wanted}: {done.stderr[-600:]}"]
-    return [*_files(folder / OUTPUT, has_ended_itself=True), *_differences(folder, undisturbed)]
+    if done.returncode != code:
+        return [f"exit code {done.returncode} instead of {code}: {done.stderr[-600:]}"]
+    return [*faults_in((folder / OUTPUT).rglob("*")), *_differences(folder, wanted)]
 
 
 def _lost(folder: Path, told: str) -> list[str]:
     """Describe a call that was asked to stop and left no result, though it did not say so."""
     is_told = NOTHING_SENTENCE in told
-    written = {path.name for path in (folder / OUTPUT).rglob("*")} - {"run.csv"}
-    return [] if is_told or written else [f"the result is lost: {told[-300:]}"]
+    is_written = any((folder / OUTPUT).iterdir())
+    return [] if is_told or is_written else [f"the result is lost: {told[-300:]}"]
 
 
-def _differences(folder: Path, undisturbed: Reference) -> list[str]:
+def _differences(folder: Path, wanted: dict[str, Any]) -> list[str]:
     """Describe the results that differ from those of an undisturbed call."""
-    found, wanted = results_of(folder), undisturbed.files
-    faults = [f"{name} is missing" for name in wanted if name not in found]
+    found, names = results_of(folder), sorted(wanted)
+    faults = [f"{name} is missing" for name in names if name not in found]
     faults += [f"{name} is left over" for name in found if name not in wanted]
-    both = [name for name in wanted if name in found]
-    return faults + [
-        _difference(name, wanted[name], found[name]) for name in both if found[name] != wanted[name]
-    ]
-
-
-def _difference(name: str, wanted: Any, found: Any) -> str:
-    """Describe in what a file differs, shortly."""
-    if isinstance(wanted, list) and isinstance(found, list) and name.endswith(".json"):
-        keys = [one[0] for one, two in zip(wanted, found, strict=False) if one != two]
-        return f"{name} differs in {', '.join(map(str, keys[:5]))}"
-    return f"{name} differs"
+    differ = [name for name in names if name in found and found[name] != wanted[name]]
+    return faults + [f"{name} differs" for name in differ]

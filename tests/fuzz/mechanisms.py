@@ -12,18 +12,16 @@ from tests.fuzz.plants import (
     INTEGRATORS,
     TAGS,
     TIMESTEPS,
-    Drive,
+    Attributes,
     Joint,
-    Plant,
-    Ranges,
     Rng,
     about_zero,
     body_text,
+    element,
     joint_attributes,
     log_uniform,
-    numbers_of,
     random_drive,
-    words_of,
+    text_of,
 )
 
 # Kinds of the first joint, and of the others.
@@ -34,21 +32,16 @@ KINDS = ("hinge", "hinge", "hinge", "slide", "ball")
 COMPONENTS = {"ball": 3, "free": 6}
 
 
-def random_mechanism(rng: Rng) -> Plant:
-    """Make a mechanism of one to three links with the keyframe `start`."""
-    return _Builder(rng).mechanism()
+class Mechanism:
+    """A random mechanism of one to three links with the keyframe `start`.
 
-
-class _Builder:
-    """Puts a random mechanism together, one section of the MJCF after the other."""
+    It has the attributes of `Plant`, and is put together one section of the MJCF after the other.
+    """
 
     def __init__(self, rng: Rng) -> None:
         self.rng = rng
-        self.ranges: Ranges = {}
-        self.features: list[str] = []
-        self.targets: list[str] = []
-        self.drives: list[Drive] = []
-        self.timestep = float(rng.choice(TIMESTEPS))
+        self.ranges, self.features, self.targets, self.drives = {}, [], [], []
+        self.timestep = rng.choice(TIMESTEPS)
         self.gravity = float(rng.choice([0.0, 0.0, 9.81]))
 
         # A loop closes only where all hinges have parallel axes.
@@ -60,12 +53,6 @@ class _Builder:
         # Gravity compensation, which actuators provide where joints say so.
         self.is_compensated = self.gravity > 0.0 and self.chance(0.3)
 
-    def chance(self, probability: float) -> bool:
-        """True with a probability."""
-        return bool(self.rng.random() < probability)
-
-    def mechanism(self) -> Plant:
-        """Put all sections together."""
         integrator, cone = (
             str(self.rng.choice(each)) for each in (INTEGRATORS, ("pyramidal", "elliptic"))
         )
@@ -83,26 +70,25 @@ class _Builder:
             kept = ("position", "tendon_length")
             self.ranges = {k: r for k, r in self.ranges.items() if k[0] in kept}
         drives = "".join(drive.element for drive in self.drives)
-        return Plant(
-            xml=(
-                '<mujoco model="mechanism">\n  <compiler angle="radian" autolimits="true"/>\n'
-                f'  <option timestep="{self.timestep}" integrator="{integrator}" cone="{cone}" '
-                f'gravity="0 0 {-self.gravity:.17g}"/>\n'
-                f'  <worldbody>\n    <site name="anchor" pos="0 0.1 0.3"/>\n{world}\n'
-                f"  </worldbody>\n  <tendon>\n{''.join(tendons.values())}  </tendon>\n"
-                f"  <actuator>\n{drives}  </actuator>\n"
-                f"  <equality>\n{equality}  </equality>\n"
-                f"  <keyframe>\n{keyframe}  </keyframe>\n</mujoco>\n"
-            ),
+        option = element(
+            "option",
             timestep=self.timestep,
-            joints=self.joints,
-            drives=tuple(self.drives),
-            targets=tuple(self.targets),
-            ranges=self.ranges,
-            can_rest=self.can_rest,
-            collides=self.collides,
-            features=tuple(self.features),
+            integrator=integrator,
+            cone=cone,
+            gravity=(0, 0, -self.gravity),
         )
+        self.xml = (
+            '<mujoco model="mechanism">\n  <compiler angle="radian" autolimits="true"/>\n'
+            f"{option}\n"
+            f'  <worldbody>\n    <site name="anchor" pos="0 0.1 0.3"/>\n{world}\n'
+            f"  </worldbody>\n  <tendon>{''.join(tendons.values())}</tendon>\n"
+            f"  <actuator>{drives}</actuator>\n  <equality>{equality}</equality>\n"
+            f"  <keyframe>{keyframe}</keyframe>\n</mujoco>\n"
+        )
+
+    def chance(self, probability: float) -> bool:
+        """True with a probability."""
+        return bool(self.rng.random() < probability)
 
     # Links
 
@@ -120,7 +106,7 @@ class _Builder:
             joint = Joint(
                 name=f"joint{i}",
                 kind=kind,
-                reach=float(rng.uniform(0.3, 2.0)) * (1.0 if is_turning else 0.5 * arm),
+                reach=rng.uniform(0.3, 2.0) * (1.0 if is_turning else 0.5 * arm),
                 inertia=load * arm**2 if is_turning else load,
                 mass=masses[i],
                 length=lengths[i],
@@ -135,8 +121,9 @@ class _Builder:
         if self.collides and (self.chance(0.5) or len(self.joints) < 3):
             drop = sum(joint.length for joint in self.joints) * self.rng.uniform(0.1, 1.0)
             self.features.append("floor")
-            plane = f'<geom name="floor" type="plane" size="5 5 1" pos="0 0 {-drop:.17g}"/>\n'
-            text = plane + text
+            text = (
+                element("geom", name="floor", type="plane", size="5 5 1", pos=(0, 0, -drop)) + text
+            )
         if self.collides:
             self.features.append("links that collide")
         return text + "    </body>" * len(self.joints)
@@ -147,44 +134,44 @@ class _Builder:
         self.targets.append(f"body/link{i}:mass")
         self.features.append(joint.kind)
         attributes = self._attributes(joint)
-        pose = f' euler="0 {rng.uniform(0.4, 1.2):.17g} 0"' if self.is_loop else ""
+        pose = f' euler="0 {text_of(rng.uniform(0.4, 1.2))} 0"' if self.is_loop else ""
         pose += ' gravcomp="1"' if self.is_compensated else ""
         place = self.joints[i - 1].length if i else 0.0
         thin = 0.05 * joint.mass * joint.length**2
-        size = joint.length * float(rng.uniform(0.05, 0.12))
+        size = joint.length * rng.uniform(0.05, 0.12)
         thicknesses = (thin, 2.0 * thin)
         return body_text(
             joint, attributes, place, thicknesses, size, pose=pose, is_solid=self.collides
         )
 
-    def _attributes(self, joint: Joint) -> dict[str, str]:
+    def _attributes(self, joint: Joint) -> Attributes:
         rng = self.rng
         if joint.is_scalar:
             attributes = joint_attributes(rng, joint, self.ranges)
             if self.is_loop:
                 attributes["axis"] = "0 1 0"
         else:
-            rate = float(rng.choice([0.1, 1.0, 5.0]))
-            attributes = {"type": joint.kind, "damping": f"{joint.inertia * rate:.17g}"}
+            rate = rng.choice([0.1, 1.0, 5.0])
+            attributes = {"type": joint.kind, "damping": joint.inertia * rate}
         if joint.kind == "ball" and self.chance(0.25):
-            largest = float(rng.uniform(0.5, 2.0))
-            attributes["range"] = numbers_of((0.0, largest))
+            largest = rng.uniform(0.5, 2.0)
+            attributes["range"] = (0.0, largest)
             self.ranges["position", joint.name] = (-largest, largest)
         if self.is_compensated and joint.kind != "free" and self.chance(0.7):
             attributes["actuatorgravcomp"] = "true"
-        if joint.kind != "free" and attributes["damping"] != "0":
+        if joint.kind != "free" and attributes["damping"]:
             self.targets.append(f"joint/{joint.name}:damping")
         return attributes
 
     # Tendons and actuators
 
-    def _tendons(self) -> dict[str, str]:
+    def _tendons(self) -> Attributes:
         """Elements of the tendons by name."""
         scalar = [joint for joint in self.joints if joint.is_scalar]
         found = {}
         if scalar and self.chance(0.3):
             inner = "".join(
-                f'<joint joint="{joint.name}" coef="{self.rng.uniform(0.3, 1.0):.17g}"/>'
+                element("joint", joint=joint.name, coef=self.rng.uniform(0.3, 1.0))
                 for joint in scalar[:2]
             )
             found["cord"] = self._tendon("cord", "fixed", inner, scalar[0])
@@ -203,7 +190,7 @@ class _Builder:
             ("frictionloss", 0.15, 0.01, 0.3),
         ):
             if self.chance(chance):
-                attributes[key] = f"{joint.inertia * rng.uniform(low, high):.17g}"
+                attributes[key] = joint.inertia * rng.uniform(low, high)
         if "damping" in attributes:
             self.targets.append(f"tendon/{name}:damping")
         shortest = -2.0 * joint.reach if kind == "fixed" else 0.0
@@ -213,9 +200,9 @@ class _Builder:
         ):
             if self.chance(0.35):
                 self.ranges[limit, name] = bounds
-                attributes[key] = numbers_of(bounds)
+                attributes[key] = bounds
         self.features.append(f"{kind} tendon ({', '.join(attributes)})")
-        return f'    <{kind} name="{name}"{words_of(attributes)}>{inner}</{kind}>\n'
+        return element(kind, inner, name=name, **attributes)
 
     def _drive(self, tendons: dict[str, str]) -> None:
         """Make all actuators, at least one."""
@@ -229,28 +216,28 @@ class _Builder:
 
         for name in tendons:
             if self.chance(0.7):
-                self._add(f"pull_{name}", f'tendon="{name}"', first, ("motor",), (1.0,))
+                self._add(f"pull_{name}", {"tendon": name}, first, ("motor",), (1.0,))
             else:
                 self.ranges.pop(("tendon_force", name), None)
         if self.chance(0.15):
             tip = len(self.joints) - 1
             push = (0.0, 0.0, 1.0)
-            self._add("thruster", f'site="tip{tip}"', self.joints[tip], ("motor",), push)
+            self._add("thruster", {"site": f"tip{tip}"}, self.joints[tip], ("motor",), push)
 
     def _on_joint(self, name: str, joint: Joint, k: int) -> None:
         """Add an actuator on a joint; the k-th of this joint."""
-        gear: tuple[float, ...] = ()
-        tags: tuple[str, ...] = (*TAGS, "intvelocity")
+        gear = ()
+        tags = (*TAGS, "intvelocity")
         if not joint.is_scalar:
             tags, width = ("motor",), COMPONENTS[joint.kind]
-            size = float(self.rng.choice([1.0, -1.0, 5.0]))
+            size = self.rng.choice([1.0, -1.0, 5.0])
             gear = tuple(size if i == k % width else 0.0 for i in range(width))
-        self._add(name, f'joint="{joint.name}"', joint, tags, gear)
+        self._add(name, {"joint": joint.name}, joint, tags, gear)
 
     def _add(
         self,
         name: str,
-        transmission: str,
+        transmission: Attributes,
         joint: Joint,
         tags: tuple[str, ...],
         gear: tuple[float, ...],
@@ -267,16 +254,16 @@ class _Builder:
     def _equality(self) -> str:
         """Elements of the equality constraints."""
         scalar = [joint.name for joint in self.joints if joint.is_scalar]
-        stiff = f'solref="{3.0 * self.timestep:.17g} 1"'
+        solref = (3.0 * self.timestep, 1)
         if self.is_loop:
             self.features.append("closed loop")
-            tip = f"{self.joints[2].length:.17g} 0 0"
-            return f'    <connect body1="link2" anchor="{tip}" {stiff}/>\n'
+            tip = (self.joints[2].length, 0, 0)
+            return element("connect", body1="link2", anchor=tip, solref=solref)
         if len(scalar) > 1 and self.chance(0.2):
             self.features.append("coupled joints")
-            ratio = self.rng.uniform(-1.5, 1.5)
-            pair = f'joint1="{scalar[0]}" joint2="{scalar[1]}"'
-            return f'    <joint {pair} polycoef="0 {ratio:.17g} 0 0 0" {stiff}/>\n'
+            ratio = (0, self.rng.uniform(-1.5, 1.5), 0, 0, 0)
+            pair = {"joint1": scalar[0], "joint2": scalar[1]}
+            return element("joint", **pair, polycoef=ratio, solref=solref)
         return ""
 
     def _keyframe(self) -> str:
@@ -289,11 +276,11 @@ class _Builder:
             if joint.is_scalar:
                 around = (-joint.reach, joint.reach)
                 bounds = self.ranges.get(("position", joint.name), around)
-                numbers.append(size * float(self.rng.uniform(*bounds)))
+                numbers.append(size * self.rng.uniform(*bounds))
                 continue
             if joint.kind == "free":
                 numbers += (size * self.rng.normal(size=3)).tolist()
             numbers += (turn / np.linalg.norm(turn)).tolist()
         self.can_rest = self.can_rest and not moves
         self.features.append("moved start" if moves else "start at zero")
-        return f'    <key name="start" qpos="{numbers_of(numbers)}"/>\n'
+        return element("key", name="start", qpos=numbers)

@@ -11,13 +11,13 @@ import shutil
 import tempfile
 import tomllib
 import zipfile
-from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
 import pyarrow
 import pyarrow.csv
 import pyarrow.parquet
+from rosbags.rosbag2 import StoragePlugin
 
 from tests.fuzz.bad_inputs import (
     CHECK,
@@ -40,8 +40,8 @@ from tests.fuzz.bad_inputs import (
     spoiled_experiment,
     spoiled_model,
     spoiled_recording,
-    toml_of,
 )
+from tests.support.ros2_bag import EPOCH, State, write
 
 # Words of the command line.
 
@@ -73,7 +73,7 @@ OUTPUTS = (
 OPTION_VALUES = ("-1", "0", "1", "nan", "inf", "1e300", "abc", "", "1.5", "99999999999999999999")
 
 COMPARE = ("compare", "study.toml", "-o", "out", "--seconds", "0.1")
-OPTIONS: tuple[tuple[Sequence[str], tuple[str, ...]], ...] = (
+OPTIONS = (
     (CHECK[:2], ("--threads", "--design", "--nonsense")),
     (DESIGN[:4], ("--threads", "--starts", "--shortest", "-x")),
     (SIMULATE, ("--seed", "--rate")),
@@ -105,7 +105,7 @@ EXECUTORS = (
 )
 
 # Calls with options whose values name nothing, and these values.
-NOTHING: tuple[tuple[Sequence[str], tuple[str, ...]], ...] = (
+NOTHING = (
     ((*MONTECARLO, "--executor"), EXECUTORS),
     ((*IDENTIFY, "--executor"), EXECUTORS),
     ((*COMPARE, "--methods"), ("", ",", " ", " , ,")),
@@ -143,9 +143,12 @@ def spoiled_words(rng: Rng, folder: Path) -> Call:
 
 # Encodings and dialects.
 
+# Texts by name, and whether each must be read, must be refused, or may be either.
+Texts = dict[str, tuple[str, bool | None]]
 
-def csv_texts(text: str) -> dict[str, tuple[str, bool | None]]:
-    """A CSV in other dialects, and whether it must be read, must be refused, or may be either."""
+
+def csv_texts(text: str) -> Texts:
+    """A CSV in other dialects."""
     header, _, rows = text.partition("\n")
     clock = re.sub(r"^[^,]+", lambda t: f"12:00:{float(t[0]):09.6f}", rows, flags=re.MULTILINE)
     return {
@@ -166,8 +169,8 @@ def csv_texts(text: str) -> dict[str, tuple[str, bool | None]]:
     }
 
 
-def toml_texts(text: str) -> dict[str, tuple[str, bool | None]]:
-    """An experiment file in other forms, and whether it must be read or be refused."""
+def toml_texts(text: str) -> Texts:
+    """An experiment file in other forms."""
     return {
         "CRLF": (text.replace("\n", "\r\n"), True),
         "CR": (text.replace("\n", "\r"), True),
@@ -225,26 +228,31 @@ def same_log_twice(rng: Rng, folder: Path) -> Call:
     return Call(words=words, spoiled=f"the same log twice, {how}", refused=True)
 
 
+# Table of an experiment file for logs in bags.
+BAG = """
+[recording.columns]
+"qpos:slide" = "position:slide"
+"qpos:hinge" = "position:hinge"
+"qvel:slide" = "velocity:slide"
+"qvel:hinge" = "velocity:hinge"
+"ctrl:force" = "effort:slide"
+"""
+
+
 def spoiled_bag(rng: Rng, folder: Path) -> Call:
     """A ROS 2 bag of which something is spoiled."""
-    try:
-        from rosbags.rosbag2 import StoragePlugin
-
-        from tests.support.ros2_bag import EPOCH, State, write
-    except ImportError:
-        return same_log_twice(rng, folder)
-
     rows, spoiled, refused = rows_of(folder), "intact", False
     if rng.random() < 0.5:
         spoiled, refused = pick(rng, (few_rows, odd_numbers, odd_times))(rng, rows)
-    names, states = ("slide", "hinge"), []
+    states = []
     for row in rows[1:]:
         given = dict(zip(rows[0], (float(cell or "nan") for cell in row), strict=True))
         stamp = EPOCH + round(1e9 * float(np.clip(np.nan_to_num(given["t"]), 0.0, 1e6)))
         position, velocity = (
-            [given[f"{kind}:{name}"] for name in names] for kind in ("qpos", "qvel")
+            [given[f"{kind}:{name}"] for name in ("slide", "hinge")] for kind in ("qpos", "qvel")
         )
-        states.append(State(stamp, names, position, velocity, [given["ctrl:force"], 0.0]))
+        effort = [given["ctrl:force"], 0.0]
+        states.append(State(stamp, ("slide", "hinge"), position, velocity, effort))
     plugin = pick(rng, (StoragePlugin.SQLITE3, StoragePlugin.MCAP))
     bag = write(folder / "bag", plugin, {"/joints": states})
     files = list(bag.iterdir())
@@ -254,11 +262,8 @@ def spoiled_bag(rng: Rng, folder: Path) -> Call:
         file.write_bytes(content)
         spoiled, refused = f"{file.name} {how}", False
 
-    columns = {f"qpos:{name}": f"position:{name}" for name in names}
-    columns |= {f"qvel:{name}": f"velocity:{name}" for name in names}
     with (folder / "study.toml").open("a", encoding="utf-8") as experiment:
-        stated = {**columns, "ctrl:force": "effort:slide"}
-        experiment.write(f"\n[recording]\ncolumns = {toml_of(stated)}\n")
+        experiment.write(BAG)
     place = pick(rng, ("bag", *(f"bag/{file.name}" for file in files if file.suffix != ".yaml")))
     refused &= spoiled.endswith(" rows")
     return Call(words=identify(place), spoiled=f"{place}: {spoiled}", refused=refused)
@@ -488,7 +493,7 @@ def two_faults(rng: Rng, folder: Path) -> Call:
 
 
 # What is spoiled, with the share of the cases.
-SPOILERS: dict[Callable[[Rng, Path], Call], float] = {
+SPOILERS = {
     spoiled_experiment: 0.2,
     spoiled_model: 0.12,
     spoiled_recording: 0.16,

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
-
-# Kinds of cases; the place of a kind in this list is part of the seed of its random numbers.
-KINDS = ("problem", "input", "kill", "mechanism", "permission", "log")
 
 # Time after which a case has failed [s]. It includes the time that a busy machine takes from it.
 TIME_LIMITS = {
@@ -18,6 +16,19 @@ TIME_LIMITS = {
     "permission": 180.0,
     "log": 600.0,
 }
+
+
+# Kinds of cases; the place of a kind in this list is part of the seed of its random numbers.
+KINDS = tuple(TIME_LIMITS)
+
+
+# File in the current folder of a process that describes the running case.
+RUNNING = Path("running.txt")
+
+
+def announce(description: str) -> None:
+    """Write down what the running case is, for the case of a crash."""
+    RUNNING.write_text(description, encoding="utf-8")
 
 
 @dataclass(frozen=True, kw_only=True)

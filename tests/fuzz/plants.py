@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 Rng = np.random.Generator
 Range = tuple[float, float]
 Ranges = dict[tuple[str, str], Range]
+Attributes = dict[str, Any]
 
 TIMESTEPS = (0.001, 0.002, 0.005, 0.01)
 INTEGRATORS = ("Euler", "RK4", "implicit", "implicitfast")
@@ -98,19 +100,22 @@ class Plant:
     features: tuple[str, ...]
 
 
-def words_of(attributes: dict[str, str]) -> str:
-    """Attributes as text, with a space before each."""
-    return "".join(f' {name}="{value}"' for name, value in attributes.items())
+def text_of(value: Any) -> str:
+    """A value as the MJCF writes it, numbers with all digits."""
+    if isinstance(value, str):
+        return value
+    return f"{value:.17g}" if np.isscalar(value) else " ".join(map(text_of, value))
 
 
-def numbers_of(values: Sequence[float]) -> str:
-    """Numbers as the MJCF writes them, with all digits."""
-    return " ".join(f"{value:.17g}" for value in values)
+def element(tag: str, inner: str | None = None, **attributes: Any) -> str:
+    """An element of the MJCF; without inner text it is closed at once."""
+    words = "".join(f' {name}="{text_of(value)}"' for name, value in attributes.items())
+    return f"<{tag}{words}/>" if inner is None else f"<{tag}{words}>{inner}</{tag}>"
 
 
 def log_uniform(rng: Rng, low: float, high: float) -> float:
     """A positive random number, uniform in its logarithm."""
-    return float(np.exp(rng.uniform(np.log(low), np.log(high))))
+    return np.exp(rng.uniform(np.log(low), np.log(high)))
 
 
 def about_zero(rng: Rng, size: float, least: float = 0.3) -> Range:
@@ -136,13 +141,13 @@ def random_plant(rng: Rng) -> Plant:
         joint = Joint(
             name=f"joint{i}",
             kind=kind,
-            reach=float(rng.uniform(0.3, 3.0)) if is_hinge else arm * float(rng.uniform(0.3, 1.0)),
+            reach=rng.uniform(0.3, 3.0) if is_hinge else arm * rng.uniform(0.3, 1.0),
             inertia=load * arm**2 if is_hinge else load,
             mass=masses[i],
             length=lengths[i],
         )
         attributes = joint_attributes(rng, joint, ranges)
-        if attributes["damping"] != "0":
+        if attributes["damping"]:
             targets.append(f"joint/{joint.name}:damping")
         thin = 0.02 * joint.mass * joint.length**2
         place = lengths[i - 1] if i else 0.0
@@ -150,19 +155,19 @@ def random_plant(rng: Rng) -> Plant:
         joints.append(joint)
 
     driven = [joint for joint in joints if rng.random() < 0.75] or [joints[0]]
-    timestep = float(rng.choice(TIMESTEPS))
+    timestep = rng.choice(TIMESTEPS)
     integrator = str(rng.choice(INTEGRATORS))
-    gravity = float(rng.choice([0.0, 0.0, 9.81, 1.6]))
+    gravity = rng.choice([0.0, 0.0, 9.81, 1.6])
     drives = [
-        random_drive(rng, f"drive_{joint.name}", f'joint="{joint.name}"', joint, ranges)
+        random_drive(rng, f"drive_{joint.name}", {"joint": joint.name}, joint, ranges)
         for joint in driven
     ]
+    option = {"timestep": timestep, "integrator": integrator, "gravity": (0, 0, -gravity)}
     elements = "".join(drive.element for drive in drives)
     return Plant(
         xml=(
             '<mujoco model="chain">\n  <compiler angle="radian" autolimits="true"/>\n'
-            f'  <option timestep="{timestep}" integrator="{integrator}" '
-            f'gravity="0 0 {-gravity:.17g}"/>\n'
+            f"{element('option', **option)}\n"
             f"  <worldbody>\n{bodies}{'</body>' * count}\n  </worldbody>\n"
             f"  <actuator>\n{elements}  </actuator>\n</mujoco>\n"
         ),
@@ -181,36 +186,32 @@ def random_plant(rng: Rng) -> Plant:
     )
 
 
-def joint_attributes(rng: Rng, joint: Joint, ranges: Ranges) -> dict[str, str]:
+def joint_attributes(rng: Rng, joint: Joint, ranges: Ranges) -> Attributes:
     """Random attributes of a slide or a hinge, whose ranges are added to those of the plant."""
     name, inertia = joint.name, joint.inertia
     axis = rng.normal(size=3) if rng.random() < 0.5 else np.eye(3)[rng.integers(3)]
     # 1 / s; a joint without damping is allowed.
     rate = rng.choice([0.0, 0.1, 1.0, 5.0])
-    attributes = {
-        "type": joint.kind,
-        "axis": numbers_of(axis),
-        "damping": f"{inertia * rate:.17g}",
-    }
+    attributes = {"type": joint.kind, "axis": axis, "damping": inertia * rate}
     for key, chance, low, high in (
         ("armature", 0.3, 0.01, 0.5),
         ("stiffness", 0.3, 1.0, 50.0),
         ("frictionloss", 0.15, 0.01, 0.3),
     ):
         if rng.random() < chance:
-            attributes[key] = f"{inertia * rng.uniform(low, high):.17g}"
+            attributes[key] = inertia * rng.uniform(low, high)
     if rng.random() < 0.5:
         ranges["position", name] = about_zero(rng, joint.reach)
-        attributes["range"] = numbers_of(ranges["position", name])
+        attributes["range"] = ranges["position", name]
     if rng.random() < 0.2:
         ranges["joint_force", name] = about_zero(rng, joint.effort)
-        attributes["actuatorfrcrange"] = numbers_of(ranges["joint_force", name])
+        attributes["actuatorfrcrange"] = ranges["joint_force", name]
     return attributes
 
 
 def body_text(
     joint: Joint,
-    attributes: dict[str, str],
+    attributes: Attributes,
     place: float,
     inertia: tuple[float, float],
     size: float,
@@ -229,27 +230,28 @@ def body_text(
         pose: Further attributes of the body.
         is_solid: True where the link collides.
     """
-    name, number = joint.name.replace("joint", "link"), joint.name.removeprefix("joint")
-    contact = "" if is_solid else ' contype="0" conaffinity="0"'
-    inertial = {
-        "pos": f"{0.5 * joint.length:.17g} 0 0",
-        "mass": f"{joint.mass:.17g}",
-        "diaginertia": numbers_of((inertia[0], inertia[1], inertia[1])),
-    }
+    name = joint.name.replace("joint", "link")
+    contact = {} if is_solid else {"contype": 0, "conaffinity": 0}
+    across, end = inertia[1], (joint.length, 0, 0)
+    link = {"name": name, "type": "capsule", "size": size, "mass": 0, **contact}
     return (
-        f'    <body name="{name}" pos="{place:.17g} 0 0"{pose}>\n'
-        f"      <inertial{words_of(inertial)}/>\n"
-        f'      <joint name="{joint.name}"{words_of(attributes)}/>\n'
-        f'      <geom name="{name}" type="capsule" size="{size:.17g}"{contact} mass="0" '
-        f'fromto="{1.3 * size:.17g} 0 0 {joint.length:.17g} 0 0"/>\n'
-        f'      <site name="tip{number}" pos="{joint.length:.17g} 0 0"/>\n'
+        f'    <body name="{name}" pos="{text_of((place, 0, 0))}"{pose}>\n'
+        + element(
+            "inertial",
+            pos=(0.5 * joint.length, 0, 0),
+            mass=joint.mass,
+            diaginertia=(inertia[0], across, across),
+        )
+        + element("joint", name=joint.name, **attributes)
+        + element("geom", **link, fromto=(1.3 * size, 0, 0, *end))
+        + element("site", name=joint.name.replace("joint", "tip"), pos=end)
     )
 
 
 def random_drive(
     rng: Rng,
     name: str,
-    transmission: str,
+    transmission: Attributes,
     joint: Joint,
     ranges: Ranges,
     *,
@@ -270,33 +272,33 @@ def random_drive(
         is_bounded: Whether its control has a range.
     """
     tag = str(rng.choice(tags))
-    gear = gear or (float(rng.choice([1.0, -1.0, 20.0, 0.1])),)
+    gear = gear or (rng.choice([1.0, -1.0, 20.0, 0.1]),)
     size = max(map(abs, gear))
     force = control = joint.effort / size
-    attributes = {"gear": numbers_of(gear)}
+    attributes = {"gear": gear}
 
     if tag in ("position", "intvelocity"):
         control = joint.reach * size
         kp = joint.effort / joint.reach * rng.uniform(1.0, 10.0) / size**2
-        attributes |= {"kp": f"{kp:.17g}", "kv": f"{0.2 * kp:.17g}"}
+        attributes |= {"kp": kp, "kv": 0.2 * kp}
         if tag == "intvelocity":
-            attributes["actrange"] = numbers_of((-2.0 * control, 2.0 * control))
+            attributes["actrange"] = (-2.0 * control, 2.0 * control)
     elif tag == "general":
         gain = log_uniform(rng, 0.1, 10.0)
         control = force / gain
-        filtered = f"{rng.uniform(0.02, 0.2):.17g}"
-        attributes |= {"dyntype": "filter", "dynprm": filtered, "gainprm": f"{gain:.17g}"}
+        filtered = rng.uniform(0.02, 0.2)
+        attributes |= {"dyntype": "filter", "dynprm": filtered, "gainprm": gain}
 
     if is_bounded:
         ranges["control", name] = about_zero(rng, control)
-        attributes["ctrlrange"] = numbers_of(ranges["control", name])
+        attributes["ctrlrange"] = ranges["control", name]
     if rng.random() < 0.4:
         ranges["force", name] = about_zero(rng, force)
-        attributes["forcerange"] = numbers_of(ranges["force", name])
+        attributes["forcerange"] = ranges["force", name]
     return Drive(
         name=name,
         tag=tag,
-        element=f'    <{tag} name="{name}" {transmission}{words_of(attributes)}/>\n',
+        element=element(tag, name=name, **transmission, **attributes),
         control=control,
         force=force,
         is_held=tag != "intvelocity",

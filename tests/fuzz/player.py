@@ -3,22 +3,27 @@
 Nothing of the package is used here: the judge of a design must not share its mistakes.
 
 An acceleration is the change of the velocity over an engine step, divided by the timestep. A force
-is whatever MuJoCo shows: what force sensors read after a step, what the fields of MjData hold
-then, and what sensors read after `mj_forward` at the state after the step.
+is whatever MuJoCo shows: what the fields of MjData hold after `mj_step`, and after `mj_forward` at
+the states before and after the step.
 """
 
 from __future__ import annotations
 
 import copy
 import csv
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
 
-Range = tuple[float, float]
+Ranges = dict[tuple[str, str], tuple[float, float]]
+Row = dict[str, float]
+State = tuple[np.ndarray, np.ndarray, np.ndarray]
+Pairs = tuple[tuple[str, str], ...]
 
 # Excess beyond a limit that rounding explains, as a fraction of half of the range. The feedback
 # adds the rounding of the planned states, which unstable plants make larger.
@@ -39,27 +44,6 @@ PARTS = {
 }
 
 
-def model_with_force_sensors(spec: mujoco.MjSpec) -> mujoco.MjModel:
-    """Compile a model with sensors of forces and lengths; nothing else changes.
-
-    The sensors show the forces of the actuators, the forces on the slides and hinges, the forces on
-    the tendons and the lengths of the tendons, each in the order of the model.
-    """
-    kinds, objects = mujoco.mjtSensor, mujoco.mjtObj
-    for actuator in spec.actuators:
-        sensor = spec.add_sensor(type=kinds.mjSENS_ACTUATORFRC, objtype=objects.mjOBJ_ACTUATOR)
-        sensor.objname = actuator.name
-    scalar = (mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtJoint.mjJNT_HINGE)
-    for joint in (joint for joint in spec.joints if joint.type in scalar):
-        sensor = spec.add_sensor(type=kinds.mjSENS_JOINTACTFRC, objtype=objects.mjOBJ_JOINT)
-        sensor.objname = joint.name
-    for kind in (kinds.mjSENS_TENDONACTFRC, kinds.mjSENS_TENDONPOS):
-        for tendon in spec.tendons:
-            sensor = spec.add_sensor(type=kind, objtype=objects.mjOBJ_TENDON)
-            sensor.objname = tendon.name
-    return spec.compile()
-
-
 @dataclass(kw_only=True)
 class Excess:
     """Largest excess beyond each limit.
@@ -69,7 +53,7 @@ class Excess:
         found: Largest excess by kind and name, as a fraction of half of the range.
     """
 
-    ranges: dict[tuple[str, str], Range]
+    ranges: Ranges
     found: dict[tuple[str, str], float] = field(default_factory=dict)
 
     def see(self, kind: str, name: str, value: float) -> None:
@@ -81,6 +65,11 @@ class Excess:
         worst = self.found.get((kind, name), -np.inf)
         self.found[kind, name] = np.inf if np.isnan(excess) else max(worst, excess)
 
+    def see_all(self, kind: str, names: list[str], values: np.ndarray) -> None:
+        """Compare a value of each name with its limit."""
+        for name, value in zip(names, values.tolist(), strict=True):
+            self.see(kind, name, value)
+
     def sentences(self, tolerance: float) -> list[str]:
         """Describe every limit that is violated by more than a tolerance."""
         return [
@@ -90,7 +79,7 @@ class Excess:
         ]
 
 
-def read_rows(path: Path) -> list[dict[str, float]]:
+def read_rows(path: Path) -> list[Row]:
     """Read the rows of design.csv or reference.csv; an empty field is NaN."""
     with path.open(newline="", encoding="utf-8") as stream:
         rows = csv.DictReader(stream)
@@ -99,17 +88,17 @@ def read_rows(path: Path) -> list[dict[str, float]]:
 
 def play(
     model: mujoco.MjModel,
-    rows: list[dict[str, float]],
-    ranges: dict[tuple[str, str], Range],
+    rows: list[Row],
+    ranges: Ranges,
     period: float,
     feedback: bool = False,
     *,
-    ignored: tuple[tuple[str, str], ...] = (),
+    ignored: Pairs = (),
 ) -> Excess:
     """Play the rows from the state of the first one, and observe every engine step.
 
     Args:
-        model: The model of `model_with_force_sensors`.
+        model: The model.
         rows: Rows of design.csv.
         ranges: Range by kind and name of every limit; the kinds "end_position" and "end_velocity"
             are deviations of the final state from the initial one, and "clearance" is the smallest
@@ -121,48 +110,49 @@ def play(
     Returns:
         The largest excess beyond every limit.
     """
-    excess = Excess(ranges=ranges)
-    data, after = mujoco.MjData(model), mujoco.MjData(model)
-    layout = Layout.of(model)
+    excess, layout = Excess(ranges=ranges), Layout(model)
+    data, still = mujoco.MjData(model), mujoco.MjData(model)
     least = ranges.get(("clearance", NEAREST))
-    proximity = None if least is None else Proximity(model, 2.0 * least[0], ignored)
+    distance = None if least is None else proximity(model, 2.0 * least[0], ignored)
     start = layout.planned(rows[0])
     data.qpos[:], data.qvel[:], data.act[:] = start
     before: np.ndarray | None = None
+
+    def look_at_state() -> None:
+        """Compare the forces at the present state with the limits."""
+        still.qpos[:], still.qvel[:], still.act[:] = data.qpos, data.qvel, data.act
+        still.ctrl[:] = data.ctrl
+        mujoco.mj_forward(model, still)
+        layout.see_forces(still, excess)
 
     for row, following in pairwise(rows):
         ctrl = np.array([row[f"ctrl:{name}"] for name in layout.drives])
         if feedback:
             ctrl += layout.gain(row) @ layout.deviation(layout.planned(row), data)
-        for i, name in enumerate(layout.drives):
-            excess.see("control", name, float(ctrl[i]))
-            if before is not None:
-                excess.see("control_rate", name, float((ctrl[i] - before[i]) / period))
+        excess.see_all("control", layout.drives, ctrl)
+        if before is not None:
+            excess.see_all("control_rate", layout.drives, (ctrl - before) / period)
         before = ctrl
 
         data.ctrl[:] = ctrl
+        look_at_state()
         for _ in range(round((following["t"] - row["t"]) / model.opt.timestep)):
-            _step((data, after), layout, excess)
-            if proximity is not None:
-                excess.see("clearance", NEAREST, proximity(data.qpos))
+            velocity = data.qvel.copy()
+            mujoco.mj_step(model, data)
+            layout.see_forces(data, excess)
+            layout.see_motion(data, (data.qvel - velocity) / model.opt.timestep, excess)
+            look_at_state()
+            if distance is not None:
+                excess.see("clearance", NEAREST, distance(data.qpos))
 
     moved = -layout.deviation(start, data)
-    for i, name in enumerate(layout.freedoms):
-        excess.see("end_position", name, float(moved[i]))
-        excess.see("end_velocity", name, float(moved[model.nv + i]))
+    excess.see_all("end_position", layout.freedoms, moved[: model.nv])
+    excess.see_all("end_velocity", layout.freedoms, moved[model.nv : 2 * model.nv])
     return excess
 
 
-def read_reference(rows: list[dict[str, float]], ranges: dict[tuple[str, str], Range]) -> Excess:
-    """Compare every value of reference.csv with its limit.
-
-    Args:
-        rows: Rows of reference.csv.
-        ranges: Range by kind and name of every limit.
-
-    Returns:
-        The largest excess beyond every limit.
-    """
+def read_reference(rows: list[Row], ranges: Ranges) -> Excess:
+    """The largest excess of the values of reference.csv beyond every limit."""
     excess = Excess(ranges=ranges)
     kinds = {
         "qpos": "position",
@@ -177,233 +167,143 @@ def read_reference(rows: list[dict[str, float]], ranges: dict[tuple[str, str], R
     return excess
 
 
-@dataclass(frozen=True, kw_only=True)
-class TurningJoint:
-    """A ball joint or a free joint; the ranges of its speeds and angles are symmetric about 0.
-
-    Attributes:
-        name: Its name.
-        is_free: True for a free joint.
-        q: Its address in qpos.
-        v: Its address in qvel.
-        body: Number of the body that it moves.
-        reference: (3, 3) orientation of the body in its parent, in the reference position.
-        up: (3,) direction in the body that is upward there, against gravity.
-    """
-
-    name: str
-    is_free: bool
-    q: int
-    v: int
-    body: int
-    reference: np.ndarray
-    up: np.ndarray
-
-    @classmethod
-    def of(cls, model: mujoco.MjModel, joint: int) -> TurningJoint:
-        """The joint with a number."""
-        data = mujoco.MjData(model)
-        mujoco.mj_kinematics(model, data)
-        body = int(model.jnt_bodyid[joint])
-        upward = -model.opt.gravity if model.opt.gravity.any() else np.array([0.0, 0.0, 1.0])
-        return cls(
-            name=model.joint(joint).name,
-            is_free=int(model.jnt_type[joint]) == int(mujoco.mjtJoint.mjJNT_FREE),
-            q=int(model.jnt_qposadr[joint]),
-            v=int(model.jnt_dofadr[joint]),
-            body=body,
-            reference=_in_parent(model, data, body),
-            up=data.xmat[body].reshape(3, 3).T @ (upward / np.linalg.norm(upward)),
-        )
-
-    def see(self, data: mujoco.MjData, acceleration: np.ndarray, excess: Excess) -> None:
-        """Compare its motion with its limits, after `mj_kinematics`.
-
-        Args:
-            data: The simulation.
-            acceleration: (nv,) accelerations.
-            excess: The limits.
-        """
-        name = self.name
-        moved, changed = data.qvel[self.v : self.v + 3], acceleration[self.v : self.v + 3]
-        excess.see("velocity", name, float(np.linalg.norm(moved)))
-        excess.see("acceleration", name, float(np.linalg.norm(changed)))
-
-        turned = self.reference.T @ _in_parent(data.model, data, self.body)
-        excess.see("tilt", name, _angle_between(turned @ self.up, self.up))
-        spin = moved
-        if self.is_free:
-            spin = data.qvel[self.v + 3 : self.v + 6]
-            for i, part in enumerate(PLACE):
-                excess.see("position", f"{name}{part}", float(data.qpos[self.q + i]))
-                excess.see("velocity", f"{name}{part}", float(moved[i]))
-                excess.see("acceleration", f"{name}{part}", float(changed[i]))
-        else:
-            # The antisymmetric part of a rotation has the norm of its sine, the trace its cosine.
-            sine = np.linalg.norm(turned - turned.T) / np.sqrt(8.0)
-            angle = np.arctan2(sine, 0.5 * (np.trace(turned) - 1.0))
-            excess.see("position", name, float(angle))
-        excess.see("angular_velocity", name, float(np.linalg.norm(spin)))
-        for i, part in enumerate(TURN):
-            excess.see("angular_velocity", f"{name}{part}", float(spin[i]))
-
-
-def _in_parent(model: mujoco.MjModel, data: mujoco.MjData, body: int) -> np.ndarray:
-    """(3, 3) orientation of a body in its parent."""
-    parent = data.xmat[model.body_parentid[body]].reshape(3, 3)
-    return parent.T @ data.xmat[body].reshape(3, 3)
-
-
-def _angle_between(a: np.ndarray, b: np.ndarray) -> float:
-    """Angle between two unit vectors [rad]."""
-    return float(2.0 * np.arctan2(np.linalg.norm(a - b), np.linalg.norm(a + b)))
-
-
-@dataclass(frozen=True, kw_only=True)
 class Layout:
     """Names of the columns of design.csv, and where MuJoCo keeps them.
 
     Attributes:
-        model: The model.
         drives: Names of the controls.
-        scalar: Names of the slides and hinges, with their numbers.
-        turning: The ball and free joints.
-        tendons: Names of the tendons.
         freedoms: Names of the degrees of freedom.
         columns: Columns of qpos, of qvel and of act.
     """
 
-    model: mujoco.MjModel
-    drives: list[str]
-    scalar: list[tuple[str, int]]
-    turning: list[TurningJoint]
-    tendons: list[str]
-    freedoms: list[str]
-    columns: tuple[list[str], list[str], list[str]]
-
-    @classmethod
-    def of(cls, model: mujoco.MjModel) -> Layout:
+    def __init__(self, model: mujoco.MjModel) -> None:
         """The layout of a model."""
-        joints = [(model.joint(i).name, i) for i in range(model.njnt)]
-        drives = [model.actuator(i).name for i in range(model.nu)]
-        filtered = [name for name in drives if model.actuator(name).actadr[0] >= 0]
-        positions, freedoms = [], []
-        for name, i in joints:
-            position, velocity = PARTS.get(int(model.jnt_type[i]), (("",), ("",)))
-            positions += [f"qpos:{name}{part}" for part in position]
-            freedoms += [f"{name}{part}" for part in velocity]
-        return cls(
-            model=model,
-            drives=drives,
-            scalar=[(name, i) for name, i in joints if int(model.jnt_type[i]) not in PARTS],
-            turning=[
-                TurningJoint.of(model, i) for _, i in joints if int(model.jnt_type[i]) in PARTS
-            ],
-            tendons=[model.tendon(i).name for i in range(model.ntendon)],
-            freedoms=freedoms,
-            columns=(
-                positions,
-                [f"qvel:{name}" for name in freedoms],
-                [f"act:{name}" for name in filtered],
-            ),
+        self.model = model
+        self.drives = [model.actuator(i).name for i in range(model.nu)]
+        self.tendons = [model.tendon(i).name for i in range(model.ntendon)]
+        joints = [model.joint(i) for i in range(model.njnt)]
+        self.turning = [joint for joint in joints if int(joint.type[0]) in PARTS]
+        self.scalar = [joint for joint in joints if int(joint.type[0]) not in PARTS]
+        positions, self.freedoms = [], []
+        for joint in joints:
+            position, velocity = PARTS.get(int(joint.type[0]), (("",), ("",)))
+            positions += [f"qpos:{joint.name}{part}" for part in position]
+            self.freedoms += [f"{joint.name}{part}" for part in velocity]
+        self.columns = (
+            positions,
+            [f"qvel:{name}" for name in self.freedoms],
+            [f"act:{name}" for name in self.drives if model.actuator(name).actadr[0] >= 0],
         )
 
-    def planned(self, row: dict[str, float]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        # The reference position, and the direction that is upward, against gravity.
+        self.reference = mujoco.MjData(model)
+        mujoco.mj_kinematics(model, self.reference)
+        upward = -model.opt.gravity if model.opt.gravity.any() else np.array([0.0, 0.0, 1.0])
+        self.upward = upward / np.linalg.norm(upward)
+
+    def planned(self, row: Row) -> State:
         """Position, velocity and activation of a row."""
         qpos, qvel, act = (np.array([row[name] for name in part]) for part in self.columns)
         return qpos, qvel, act
 
-    def deviation(
-        self, planned: tuple[np.ndarray, np.ndarray, np.ndarray], data: mujoco.MjData
-    ) -> np.ndarray:
+    def deviation(self, planned: State, data: mujoco.MjData) -> np.ndarray:
         """(2 nv + na,) planned state minus the state of a simulation; rotations as vectors."""
         qpos, qvel, act = planned
         moved = np.zeros(self.model.nv)
         mujoco.mj_differentiatePos(self.model, moved, 1.0, data.qpos, qpos)
         return np.concatenate([moved, qvel - data.qvel, act - data.act])
 
-    def gain(self, row: dict[str, float]) -> np.ndarray:
+    def gain(self, row: Row) -> np.ndarray:
         """(nu, 2 nv + na) gains of a row."""
         names = [f"qpos:{name}" for name in self.freedoms] + [*self.columns[1], *self.columns[2]]
         return np.array([[row[f"gain:{drive}:{name}"] for name in names] for drive in self.drives])
 
+    def see_forces(self, data: mujoco.MjData, excess: Excess) -> None:
+        """Compare the forces and the lengths of tendons with their limits."""
+        pulled = np.zeros(self.model.ntendon)
+        for i in np.flatnonzero(self.model.actuator_trntype == int(mujoco.mjtTrn.mjTRN_TENDON)):
+            pulled[self.model.actuator_trnid[i, 0]] += data.actuator_force[i]
+        excess.see_all("force", self.drives, data.actuator_force)
+        for joint in self.scalar:
+            excess.see("joint_force", joint.name, data.qfrc_actuator[joint.dofadr[0]])
+        excess.see_all("tendon_force", self.tendons, pulled)
+        excess.see_all("tendon_length", self.tendons, data.ten_length)
 
-def _step(
-    simulations: tuple[mujoco.MjData, mujoco.MjData],
-    layout: Layout,
-    excess: Excess,
-) -> None:
-    """Do one engine step of the first simulation, and compare what it shows with the limits.
+    def see_motion(self, data: mujoco.MjData, acceleration: np.ndarray, excess: Excess) -> None:
+        """Compare the motion of all joints with its limits."""
+        for joint in self.scalar:
+            q, v = int(joint.qposadr[0]), int(joint.dofadr[0])
+            excess.see("position", joint.name, data.qpos[q])
+            excess.see("velocity", joint.name, data.qvel[v])
+            excess.see("acceleration", joint.name, acceleration[v])
+        if self.turning:
+            mujoco.mj_kinematics(self.model, data)
+        for joint in self.turning:
+            self._see_turning(joint, data, acceleration, excess)
 
-    The second simulation shows the forces at the state after the step, with the control of the
-    step.
-    """
-    data, after = simulations
-    model = data.model
-    velocity = data.qvel.copy()
-    mujoco.mj_step(model, data)
-    acceleration = (data.qvel - velocity) / model.opt.timestep
+    def _see_turning(
+        self, joint: Any, data: mujoco.MjData, acceleration: np.ndarray, excess: Excess
+    ) -> None:
+        """Compare the motion of a ball joint or a free joint with its limits, which for speeds and
+        angles are symmetric about 0.
+        """
+        name, q, v = joint.name, int(joint.qposadr[0]), int(joint.dofadr[0])
+        moved, changed = data.qvel[v : v + 3], acceleration[v : v + 3]
+        excess.see("velocity", name, np.linalg.norm(moved))
+        excess.see("acceleration", name, np.linalg.norm(changed))
 
-    for name, i in layout.scalar:
-        q, v = model.jnt_qposadr[i], model.jnt_dofadr[i]
-        excess.see("position", name, float(data.qpos[q]))
-        excess.see("velocity", name, float(data.qvel[v]))
-        excess.see("acceleration", name, float(acceleration[v]))
-    if layout.turning:
-        mujoco.mj_kinematics(model, data)
-    for joint in layout.turning:
-        joint.see(data, acceleration, excess)
+        body = int(joint.bodyid[0])
+        turned = self._in_parent(self.reference, body).T @ self._in_parent(data, body)
+        up = self.reference.xmat[body].reshape(3, 3).T @ self.upward
+        tilted = turned @ up
+        # The angle between two unit vectors.
+        tilt = 2.0 * np.arctan2(np.linalg.norm(tilted - up), np.linalg.norm(tilted + up))
+        excess.see("tilt", name, float(tilt))
+        spin = moved
+        if int(joint.type[0]) == int(mujoco.mjtJoint.mjJNT_FREE):
+            spin = data.qvel[v + 3 : v + 6]
+            places = [f"{name}{part}" for part in PLACE]
+            excess.see_all("position", places, data.qpos[q : q + 3])
+            excess.see_all("velocity", places, moved)
+            excess.see_all("acceleration", places, changed)
+        else:
+            # The antisymmetric part of a rotation has the norm of its sine, the trace its cosine.
+            sine = np.linalg.norm(turned - turned.T) / np.sqrt(8.0)
+            angle = np.arctan2(sine, 0.5 * (np.trace(turned) - 1.0))
+            excess.see("position", name, float(angle))
+        excess.see("angular_velocity", name, np.linalg.norm(spin))
+        excess.see_all("angular_velocity", [f"{name}{part}" for part in TURN], spin)
 
-    after.qpos[:], after.qvel[:], after.act[:] = data.qpos, data.qvel, data.act
-    after.ctrl[:] = data.ctrl
-    mujoco.mj_forward(model, after)
-
-    dofs = [int(model.jnt_dofadr[i]) for _, i in layout.scalar]
-    pulled = np.zeros(model.ntendon)
-    for i in np.flatnonzero(model.actuator_trntype == int(mujoco.mjtTrn.mjTRN_TENDON)):
-        pulled[model.actuator_trnid[i, 0]] += data.actuator_force[i]
-    fields = np.concatenate(
-        [data.actuator_force, data.qfrc_actuator[dofs], pulled, data.ten_length]
-    )
-    limited = [("force", name) for name in layout.drives]
-    limited += [("joint_force", name) for name, _ in layout.scalar]
-    limited += [("tendon_force", name) for name in layout.tendons]
-    limited += [("tendon_length", name) for name in layout.tendons]
-    for shown in (fields, data.sensordata, after.sensordata):
-        for (kind, name), value in zip(limited, shown.tolist(), strict=True):
-            excess.see(kind, name, value)
+    def _in_parent(self, data: mujoco.MjData, body: int) -> np.ndarray:
+        """(3, 3) orientation of a body in its parent."""
+        parent = data.xmat[self.model.body_parentid[body]].reshape(3, 3)
+        return parent.T @ data.xmat[body].reshape(3, 3)
 
 
-class Proximity:
-    """Smallest distance between the geoms that MuJoCo lets collide.
+def proximity(model: mujoco.MjModel, reach: float, ignored: Pairs) -> Callable[[np.ndarray], float]:
+    """Smallest distance between the geoms that MuJoCo lets collide, as a function of the position.
 
     Contacts are found by MuJoCo itself: in a copy of the model in which they begin at a larger
     distance.
+
+    Args:
+        model: The model.
+        reach: Distance below which geoms are seen, which is returned where nothing is nearer [m].
+        ignored: Pairs of bodies whose distance does not matter.
     """
+    model = copy.copy(model)
+    model.geom_margin[:] = model.body_margin[:] = reach
+    model.geom_gap[:] = 0.0
+    model.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
+    data = mujoco.MjData(model)
+    pairs = [{model.body(name).id for name in pair} for pair in ignored]
 
-    def __init__(
-        self, model: mujoco.MjModel, reach: float, ignored: tuple[tuple[str, str], ...]
-    ) -> None:
-        """Prepare the copy.
+    def distance(qpos: np.ndarray) -> float:
+        """Smallest distance at a position [m]."""
+        data.qpos[:] = qpos
+        mujoco.mj_fwdPosition(model, data)
+        bodies = model.geom_bodyid[data.contact.geom]
+        counted = [set(pair) not in pairs for pair in bodies.tolist()]
+        return data.contact.dist[counted].min(initial=reach)
 
-        Args:
-            model: The model.
-            reach: Distance below which geoms are seen [m].
-            ignored: Pairs of bodies whose distance does not matter.
-        """
-        self._model = copy.copy(model)
-        self._model.geom_margin[:] = self._model.body_margin[:] = reach
-        self._model.geom_gap[:] = 0.0
-        self._model.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
-        self._data = mujoco.MjData(self._model)
-        self._reach = reach
-        self._ignored = [{model.body(name).id for name in pair} for pair in ignored]
-
-    def __call__(self, qpos: np.ndarray) -> float:
-        """Smallest distance at a position [m], the reach where nothing is nearer."""
-        self._data.qpos[:] = qpos
-        mujoco.mj_fwdPosition(self._model, self._data)
-        contacts = self._data.contact
-        bodies = self._model.geom_bodyid[contacts.geom]
-        counted = [set(pair) not in self._ignored for pair in bodies.tolist()]
-        return float(contacts.dist[counted].min(initial=self._reach))
+    return distance

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import mujoco
 import numpy as np
@@ -14,9 +13,9 @@ from mjfim.errors import MjfimError
 from mjfim.experiment.system import System
 from mjfim.output.archive import write_data
 from mjfim.records.design import keeps_limits
-from tests.fuzz.bad_inputs import pick
-from tests.fuzz.mechanisms import random_mechanism
-from tests.fuzz.outcome import Case, Outcome
+from tests.fuzz.bad_inputs import Tables, pick
+from tests.fuzz.mechanisms import Mechanism
+from tests.fuzz.outcome import Case, Outcome, announce
 from tests.fuzz.plants import Plant, Ranges, Rng, about_zero, random_plant
 from tests.fuzz.player import (
     NEAREST,
@@ -24,12 +23,10 @@ from tests.fuzz.player import (
     ROUNDING,
     ROUNDING_WITH_FEEDBACK,
     TURN,
-    model_with_force_sensors,
     play,
     read_reference,
     read_rows,
 )
-from tests.fuzz.workers import announce
 
 # Time of one design [s]; the iterations end most of them before.
 SECONDS = 15.0
@@ -43,7 +40,7 @@ def run(case: Case, folder: Path) -> Outcome:
         folder: Empty folder for its files.
     """
     rng = case.rng
-    plant = random_plant(rng) if case.kind == "problem" else random_mechanism(rng)
+    plant = random_plant(rng) if case.kind == "problem" else Mechanism(rng)
     tables = random_tables(rng, plant)
     if case.kind == "mechanism":
         complicate(rng, plant, tables)
@@ -71,11 +68,11 @@ def run(case: Case, folder: Path) -> Outcome:
     return Outcome(case=case, group="claimed", description=description, complaint=complaint)
 
 
-def violations(plant: Plant, tables: dict[str, Any], folder: Path) -> list[str]:
+def violations(plant: Plant, tables: Tables, folder: Path) -> list[str]:
     """Describe what is violated where design.csv of a folder is played with and without feedback,
     and in the values of reference.csv.
     """
-    model = model_with_force_sensors(mujoco.MjSpec.from_file(str(folder / "plant.xml")))
+    model = mujoco.MjModel.from_xml_path(str(folder / "plant.xml"))
     rows, ranges = read_rows(folder / "design.csv"), all_ranges(plant, tables)
     period = 1.0 / tables.get("playback_rate", tables["rate"])
     ignored = tables["limits"].get("ignored", ())
@@ -96,7 +93,7 @@ def omissions(plant: Plant, warnings: tuple[str, ...]) -> list[str]:
     return [f"no warning names the range of {name}" for name in unheld if name not in told]
 
 
-def all_ranges(plant: Plant, tables: dict[str, Any]) -> Ranges:
+def all_ranges(plant: Plant, tables: Tables) -> Ranges:
     """Range of every limit by kind and name: where MJCF and file state one, both hold."""
     joints = [joint.name for joint in plant.joints]
     turning = [joint.name for joint in plant.joints if not joint.is_scalar]
@@ -128,7 +125,7 @@ def all_ranges(plant: Plant, tables: dict[str, Any]) -> Ranges:
     return ranges
 
 
-def by_coordinate(stated: dict[str, Any]) -> dict[str, Any]:
+def by_coordinate(stated: Tables) -> Tables:
     """A table in which the three ranges of a free joint have the names of its coordinates."""
     table = {}
     for name, value in stated.items():
@@ -138,13 +135,13 @@ def by_coordinate(stated: dict[str, Any]) -> dict[str, Any]:
     return table
 
 
-def random_tables(rng: Rng, plant: Plant) -> dict[str, Any]:
+def random_tables(rng: Rng, plant: Plant) -> Tables:
     substeps = int(rng.choice([1, 2, 4, 5]))
     sample = substeps * plant.timestep
     horizon = int(rng.integers(20, 60)) * sample
     count = min(int(rng.integers(1, 4)), len(plant.targets))
     chosen = rng.choice(plant.targets, count, replace=False).tolist()
-    tables: dict[str, Any] = {
+    tables = {
         "model": "plant.xml",
         "rate": 1.0 / sample,
         "horizon": horizon,
@@ -168,9 +165,9 @@ def random_tables(rng: Rng, plant: Plant) -> dict[str, Any]:
     return tables
 
 
-def _limits(rng: Rng, plant: Plant, horizon: float) -> dict[str, Any]:
+def _limits(rng: Rng, plant: Plant, horizon: float) -> Tables:
     """Random limits; each slide or hinge and each actuator states some of them."""
-    limits: dict[str, Any] = {}
+    limits = {}
     for joint in plant.joints:
         if joint.is_scalar:
             speed = joint.reach / horizon * rng.uniform(0.5, 5.0)
@@ -188,15 +185,15 @@ def _limits(rng: Rng, plant: Plant, horizon: float) -> dict[str, Any]:
         }
         _state_some(rng, limits, drive.name, wanted, (0.4, 0.3, 0.3))
     if rng.random() < 0.15:
-        limits["bandwidth"] = float(rng.uniform(2.0, 6.0)) / horizon
+        limits["bandwidth"] = rng.uniform(2.0, 6.0) / horizon
     return limits
 
 
 def _state_some(
     rng: Rng,
-    limits: dict[str, Any],
+    limits: Tables,
     name: str,
-    wanted: dict[str, Any],
+    wanted: Tables,
     chances: tuple[float, ...],
 ) -> None:
     for (kind, value), chance in zip(wanted.items(), chances, strict=True):
@@ -205,9 +202,9 @@ def _state_some(
             limits.setdefault(kind, {})[name] = stated
 
 
-def _boundary(rng: Rng, plant: Plant) -> dict[str, Any]:
+def _boundary(rng: Rng, plant: Plant) -> Tables:
     """A random boundary; most problems state none."""
-    boundary: dict[str, Any] = {"position": 0.01, "velocity": 0.02}
+    boundary = {"position": 0.01, "velocity": 0.02}
     if not plant.can_rest and rng.random() < 0.9:
         return boundary
     if rng.random() < 0.3:
@@ -215,17 +212,17 @@ def _boundary(rng: Rng, plant: Plant) -> dict[str, Any]:
     return {**boundary, "end": str(rng.choice(["free", "free", "free", "rest", "periodic"]))}
 
 
-def _control(rng: Rng, plant: Plant, horizon: float) -> dict[str, Any]:
+def _control(rng: Rng, plant: Plant, horizon: float) -> Tables:
     """A random initial control."""
-    size = float(rng.choice([0.01, 0.1, 0.5]))
+    size = rng.choice([0.01, 0.1, 0.5])
     return {
         "kind": str(rng.choice(["sine", "chirp", "multisine"])),
         "amplitude": {drive.name: size * drive.control for drive in plant.drives} or 1.0,
-        "frequency": float(rng.uniform(0.5, 3.0)) / horizon,
+        "frequency": rng.uniform(0.5, 3.0) / horizon,
     }
 
 
-def complicate(rng: Rng, plant: Plant, tables: dict[str, Any]) -> None:
+def complicate(rng: Rng, plant: Plant, tables: Tables) -> None:
     """Add to the tables what only mechanisms have, or what chains do not state."""
     limits, horizon = tables["limits"], tables["horizon"]
     tables["initial"]["keyframe"] = "start"
@@ -245,7 +242,7 @@ def complicate(rng: Rng, plant: Plant, tables: dict[str, Any]) -> None:
         size = joint.reach * rng.uniform(0.5, 2.0)
         box = tuple(about_zero(rng, size) for _ in PLACE)
         wanted = {
-            "position": box if joint.kind == "free" else (0.0, float(rng.uniform(0.4, 2.0))),
+            "position": box if joint.kind == "free" else (0.0, rng.uniform(0.4, 2.0)),
             "velocity": speed * rng.uniform(0.5, 5.0),
             "acceleration": speed / horizon * rng.uniform(5.0, 50.0),
             "angular_velocity": rng.uniform(0.5, 5.0) / horizon,
@@ -256,10 +253,10 @@ def complicate(rng: Rng, plant: Plant, tables: dict[str, Any]) -> None:
     for kind, power in (("velocity", 1), ("acceleration", 2)):
         if rng.random() < 0.15:
             fastest = max(joint.reach for joint in plant.joints) / horizon**power
-            limits[kind] = float(fastest * rng.uniform(3.0, 30.0))
+            limits[kind] = fastest * rng.uniform(3.0, 30.0)
     if plant.collides and rng.random() < 0.6:
         shortest = min(joint.length for joint in plant.joints)
-        limits["clearance"] = float(shortest * rng.uniform(0.001, 0.1))
+        limits["clearance"] = shortest * rng.uniform(0.001, 0.1)
         if len(plant.joints) > 2 and rng.random() < 0.3:
             limits["ignored"] = (("link0", "link2"),)
 
@@ -271,7 +268,7 @@ def complicate(rng: Rng, plant: Plant, tables: dict[str, Any]) -> None:
         tables["robust"] = {"over": str(rng.choice(["mean", "worst"])), "samples": 2}
 
 
-def describe(plant: Plant, tables: dict[str, Any]) -> str:
+def describe(plant: Plant, tables: Tables) -> str:
     """Describe a problem in a line."""
     boundary = tables["boundary"]
     words = [*plant.features, f"{boundary.get('start', 'given')} to {boundary.get('end', 'free')}"]

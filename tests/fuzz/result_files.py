@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import re
-from collections.abc import Callable
+from collections.abc import Iterable
 from pathlib import Path
 
 import mujoco
@@ -65,7 +65,7 @@ def _xml(path: Path) -> None:
     mujoco.MjModel.from_xml_path(str(path))
 
 
-READERS: dict[str, Callable[[Path], None]] = {
+READERS = {
     ".json": _json,
     ".npz": _npz,
     ".csv": _csv,
@@ -76,19 +76,23 @@ READERS: dict[str, Callable[[Path], None]] = {
 
 
 def faults_of(path: Path) -> list[str]:
-    """Describe what is wrong with a file of results; nothing if it is whole.
-
-    Args:
-        path: The file.
-    """
-    reader = READERS.get(path.suffix)
-    if reader is None:
-        return []
+    """Describe what is wrong with a file of results; nothing if it is whole."""
     try:
-        reader(path)
+        READERS.get(path.suffix, Path.stat)(path)
     except Exception as error:
         return [f"{path.name} is not whole: {error}"]
     return []
+
+
+def faults_in(files: Iterable[Path], *, may_be_temporary: bool = False) -> list[str]:
+    """Describe the files that are not whole, and temporary files that should have been removed."""
+    found: list[str] = []
+    for path in sorted(file for file in files if file.is_file()):
+        if not is_temporary(path):
+            found += faults_of(path)
+        elif not may_be_temporary:
+            found.append(f"{path.name} is a temporary file that stayed")
+    return found
 
 
 def is_temporary(path: Path) -> bool:

@@ -6,26 +6,25 @@ import contextlib
 import gc
 import multiprocessing
 import os
-import queue
-import signal
 import sys
 import tempfile
 import threading
 import time
 import traceback
 from collections.abc import Iterable, Iterator
+from concurrent.futures import BrokenExecutor, ProcessPoolExecutor
 from dataclasses import replace
-from multiprocessing.connection import Connection
+from multiprocessing.pool import ThreadPool
 from pathlib import Path
 
-from tests.fuzz.outcome import TIME_LIMITS, Case, Outcome
+import psutil
+
+from tests.fuzz import inputs, kills, problems
+from tests.fuzz.outcome import RUNNING, TIME_LIMITS, Case, Outcome, announce
 from tests.support.paths import ROOT
 
 # Memory that a worker may use [bytes]; a case that wants more fails with MemoryError.
 MEMORY = 8 * 2**30
-
-# Time that a new worker may take for its imports and its inputs [s].
-PREPARATION = 180.0
 
 
 def run_case(case: Case, folder: Path) -> Outcome:
@@ -35,8 +34,6 @@ def run_case(case: Case, folder: Path) -> Outcome:
         case: The case.
         folder: Empty folder for its files.
     """
-    from tests.fuzz import inputs, kills, problems
-
     begin = time.monotonic()
     runs = {
         "problem": problems.run,
@@ -70,34 +67,24 @@ def run_cases(cases: Iterable[Case], workers: int, seconds: float) -> Iterator[O
     Yields:
         The outcomes, in the order in which they end.
     """
-    waiting: queue.SimpleQueue[Case] = queue.SimpleQueue()
-    for case in cases:
-        waiting.put(case)
-    ended: queue.SimpleQueue[Outcome | None] = queue.SimpleQueue()
     deadline = time.monotonic() + seconds
+    here, started = threading.local(), []
 
-    def work() -> None:
-        """Run cases one after the other until there is none, or until the time is up."""
-        worker = Worker()
+    def run(case: Case) -> Outcome | None:
+        """Run a case in the worker of this thread, unless the time is up."""
+        if time.monotonic() > deadline:
+            return None
+        if not hasattr(here, "worker"):
+            here.worker = Worker()
+            started.append(here.worker)
+        return here.worker.run(case)
+
+    with ThreadPool(workers) as threads:
         try:
-            while time.monotonic() < deadline:
-                ended.put(worker.run(waiting.get_nowait()))
-        except queue.Empty:
-            pass
+            yield from filter(None, threads.imap_unordered(run, cases))
         finally:
-            worker.stop()
-            ended.put(None)
-
-    threads = [threading.Thread(target=work) for _ in range(workers)]
-    for thread in threads:
-        thread.start()
-    running = len(threads)
-    while running:
-        outcome = ended.get()
-        if outcome is None:
-            running -= 1
-        else:
-            yield outcome
+            for worker in started:
+                worker.stop()
 
 
 class Worker:
@@ -111,34 +98,22 @@ class Worker:
     def _start(self) -> None:
         """Start the process, and wait until it is ready."""
         context = multiprocessing.get_context("spawn")
-        self._connection, theirs = context.Pipe()
-        self._process = context.Process(target=_serve, args=(theirs, self._home.name))
-        self._process.start()
-        theirs.close()
-        if not self._connection.poll(PREPARATION):
-            raise TimeoutError("a worker of the fuzz suite does not start")
-        self._connection.recv()
+        self._executor = ProcessPoolExecutor(1, context, _begin, (self._home.name,))
+        self._pid = self._executor.submit(os.getpid).result()
 
     def run(self, case: Case) -> Outcome:
         """Run a case; a crash and a case without an end are outcomes."""
         limit = TIME_LIMITS[case.kind]
-        self._connection.send(case)
-        description = ""
-        while self._connection.poll(limit):
-            try:
-                received = self._connection.recv()
-            except (EOFError, ConnectionError):
-                self._process.join(10.0)
-                fault = f"the process crashed, exit code {self._process.exitcode}"
-                break
-            if isinstance(received, Outcome):
-                return received
-            description = received
-        else:
+        try:
+            return self._executor.submit(_run_in_folder, case).result(limit)
+        except BrokenExecutor:
+            fault = "the process crashed"
+        except TimeoutError:
             fault = f"no end after {limit:g} s"
 
         self._kill()
         self._start()
+        description = (self._home.name / RUNNING).read_text(encoding="utf-8")
         return Outcome(case=case, group="crash", description=description, complaint=fault)
 
     def stop(self) -> None:
@@ -148,49 +123,30 @@ class Worker:
 
     def _kill(self) -> None:
         """End the process and what it has started."""
-        if hasattr(os, "killpg") and self._process.pid is not None:
-            with contextlib.suppress(ProcessLookupError):
-                os.killpg(self._process.pid, signal.SIGKILL)
-        self._process.kill()
-        self._process.join()
-        self._connection.close()
+        with contextlib.suppress(psutil.NoSuchProcess):
+            process = psutil.Process(self._pid)
+            for each in (*process.children(recursive=True), process):
+                each.kill()
+        self._executor.shutdown()
 
 
-# Sends the description of the running case to the parent process, which needs it after a crash.
-_parent: list[Connection] = []
+def _begin(home: str) -> None:
+    """Prepare a worker process."""
+    # Where the system can limit it.
+    if sys.platform != "win32":
+        import resource
 
-
-def announce(description: str) -> None:
-    """Tell the parent process what the running case is."""
-    for connection in _parent:
-        connection.send(description)
-
-
-def _serve(connection: Connection, home: str) -> None:
-    """Run the cases that arrive, each in an empty folder inside `home`, until the parent ends."""
-    if hasattr(os, "setsid"):
-        os.setsid()
-    _limit_memory()
+        _, hard = resource.getrlimit(resource.RLIMIT_DATA)
+        resource.setrlimit(resource.RLIMIT_DATA, (MEMORY, hard))
 
     # MuJoCo writes its log into the current folder; processes still have to find the package.
     sys.path.insert(0, str(ROOT))
     os.environ["PYTHONPATH"] = str(ROOT)
     os.chdir(home)
-    _parent.append(connection)
-    connection.send("ready")
-
-    with contextlib.suppress(EOFError, ConnectionError):
-        while True:
-            case = connection.recv()
-            with tempfile.TemporaryDirectory(dir=home, ignore_cleanup_errors=True) as folder:
-                connection.send(run_case(case, Path(folder)))
+    announce("")
 
 
-def _limit_memory() -> None:
-    """Limit the memory of this process, where the system can."""
-    try:
-        import resource
-    except ImportError:
-        return
-    _, hard = resource.getrlimit(resource.RLIMIT_DATA)
-    resource.setrlimit(resource.RLIMIT_DATA, (MEMORY, hard))
+def _run_in_folder(case: Case) -> Outcome:
+    """Run a case in a folder of its own."""
+    with tempfile.TemporaryDirectory(dir=Path.cwd(), ignore_cleanup_errors=True) as folder:
+        return run_case(case, Path(folder))

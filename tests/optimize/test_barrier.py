@@ -93,7 +93,7 @@ def test_the_barrier_of_bounds_is_the_sum_over_both_bounds(delta: float) -> None
     def values(numbers: Array) -> Array:
         sides = np.array([numbers - LOWER, UPPER - numbers]) / bounds.scale
         beta = relaxed_log_barrier(np.where(np.isfinite(sides), sides, 1.0), delta)[0]
-        return np.asarray(0.25 * beta.sum(axis=0))
+        return 0.25 * beta.sum(axis=0)
 
     barrier, up, down = (bounds.barrier(r + move, delta, 0.25) for move in (0.0, h, -h))
     assert barrier.value == pytest.approx(values(r).sum(), rel=1e-12)
@@ -154,9 +154,3 @@ def test_models_with_the_curvature_along_their_minimum_lead_to_that_of_the_barri
     assert abs(newton[0] - wanted) > 0.2 * abs(
         wanted
     )  # the curvature at the beginning leads elsewhere
-
-
-def test_the_curvature_along_a_step_is_that_at_its_beginning_without_a_step_or_a_bound() -> None:
-    slacks = np.array([0.5, 1e-4, -0.02, INF, INF])
-    changes = np.array([0.0, 0.0, 0.0, 3.0, -3.0])
-    assert_array_equal(curvature_factors(slacks, changes, np.ones(5), 1e-3), np.ones(5))

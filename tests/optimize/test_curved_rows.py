@@ -13,33 +13,6 @@ from tests.support.numerics import Array
 COUNT = 3
 
 
-def linearisation(rng: np.random.Generator, common_rows: Array) -> Condensed:
-    """Random rows of two segments with two private unknowns each."""
-    m = 2 + COUNT + 1
-    return Condensed(
-        blocks=np.linalg.qr(rng.normal(size=(2, 9, m)), mode="r"),
-        segment_of_block=np.arange(2),
-        private_rows=np.zeros((2, 0, m)),
-        common_rows=common_rows,
-    )
-
-
-def test_over_straight_rows_it_is_the_linear_step() -> None:
-    rng = np.random.default_rng(0)
-    rows = rng.normal(size=(4, COUNT + 1))
-    condensed = linearisation(rng, rows)
-    scale, bound = condensed.column_norms, np.full(COUNT, 0.2)
-
-    def straight(step: Array) -> Array:
-        return np.column_stack([rows[:, :-1], rows[:, :-1] @ step + rows[:, -1]])
-
-    expected = condensed.step(1e-3, scale, -bound, bound)
-    found = step_over_curved_rows(condensed, straight, 1e-3, scale, -bound, bound)
-    assert_allclose(found.common, expected.common, atol=1e-10)
-    assert_allclose(found.private, expected.private, atol=1e-10)
-    assert np.isclose(found.predicted_decrease, expected.predicted_decrease)
-
-
 def test_over_a_barrier_it_is_the_minimum_inside() -> None:
     pull = np.array([60.0, 0.0, 0.0, 120.0])
 
@@ -52,7 +25,14 @@ def test_over_a_barrier_it_is_the_minimum_inside() -> None:
         return np.concatenate([barrier, straight[None]])
 
     zero, infinite = np.zeros(COUNT), np.full(COUNT, np.inf)
-    condensed = linearisation(np.random.default_rng(1), curved(zero))
+    # Random rows of two segments with two private unknowns each.
+    m = 2 + COUNT + 1
+    condensed = Condensed(
+        blocks=np.linalg.qr(np.random.default_rng(1).normal(size=(2, 9, m)), mode="r"),
+        segment_of_block=np.arange(2),
+        private_rows=np.zeros((2, 0, m)),
+        common_rows=curved(zero),
+    )
     scale, data = condensed.column_norms, condensed.reduced_rows()
     found = step_over_curved_rows(condensed, curved, 0.0, scale, -infinite, infinite)
 
@@ -61,7 +41,7 @@ def test_over_a_barrier_it_is_the_minimum_inside() -> None:
         if rows is None:
             return np.inf
         residual = data[:, :-1] @ step + data[:, -1]
-        return 0.5 * float(residual @ residual + rows[:, -1] @ rows[:, -1])
+        return 0.5 * (residual @ residual + rows[:, -1] @ rows[:, -1])
 
     sharp = {"xatol": 1e-9, "fatol": 1e-12}
     best = scipy.optimize.minimize(cost, zero, method="Nelder-Mead", options=sharp)
@@ -73,3 +53,14 @@ def test_over_a_barrier_it_is_the_minimum_inside() -> None:
 
     # The linear step leaves the region.
     assert condensed.step(0.0, scale, -infinite, infinite).common[0] < -1.0
+
+    # Over straight rows it is the linear step, also within bounds.
+    rows, bound = condensed.common_rows, np.full(COUNT, 0.2)
+
+    def straight(step: Array) -> Array:
+        return np.column_stack([rows[:, :-1], rows[:, :-1] @ step + rows[:, -1]])
+
+    linear = condensed.step(1e-3, scale, -bound, bound)
+    found = step_over_curved_rows(condensed, straight, 1e-3, scale, -bound, bound)
+    for name in ("common", "private", "predicted_decrease"):
+        assert_allclose(getattr(found, name), getattr(linear, name), atol=1e-10)

@@ -59,8 +59,8 @@ def test_the_model_is_the_criterion_of_changed_information(values: str) -> None:
 
     def expected(d: Array) -> float:
         moved = np.diag(np.log(model.eigenvalues)) + symmetric_matrix(d, 3)
-        return model.weight * float(
-            np.log(smooth_e_optimality(np.asarray(expm(moved)), model.power).value)
+        return model.weight * np.log(
+            smooth_e_optimality(np.asarray(expm(moved)), model.power).value
         )
 
     zero = np.zeros(6)
@@ -93,7 +93,7 @@ def test_the_minimising_gradient_solves_the_proximal_problem(values: str) -> Non
         spread, d0 = root @ root.T, 0.2 * rng.normal(size=3)
 
         def cost(y: Array, root: Array = root, d0: Array = d0) -> float:
-            return value(model, d0 + root @ y) + 0.5 * float(y @ y)
+            return value(model, d0 + root @ y) + 0.5 * (y @ y)
 
         w = model.minimising_gradient(d0, spread)
         best = minimize(cost, np.zeros(rank), method="BFGS", options={"gtol": 1e-10})
@@ -122,7 +122,7 @@ def test_divided_differences_give_the_derivative_of_the_matrix_logarithm() -> No
     ids=["plain", "nuisance", "delay and sensors"],
 )
 def test_slopes_agree_with_the_logarithm_of_simulated_information(
-    tables: dict[str, Any], tmp_path: Path
+    tables: Any, tmp_path: Path
 ) -> None:
     """Compare along random controls, in the eigenvectors of the point, also off the diagonal."""
     task = cart_task(tmp_path, limits=LIMITS, **tables).relaxed()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
+from typing import Any
 
 import numpy as np
 import pytest
@@ -28,7 +29,7 @@ def form(weights: Weights, z: np.ndarray, v: np.ndarray) -> float:
     changes = np.diff(v, axis=0, prepend=0.0, append=0.0)
     of_states = np.einsum("ki,kij,kj->", z, weights.Q, z)
     of_controls = np.einsum("ku,kuw,kw->", v, weights.R, v) + np.sum(weights.W * changes**2)
-    return float(of_states + of_controls + 2.0 * np.einsum("ku,kui,ki->", v, weights.S, z[:-1]))
+    return of_states + of_controls + 2.0 * np.einsum("ku,kui,ki->", v, weights.S, z[:-1])
 
 
 @pytest.mark.parametrize("steps", [False, True], ids=["free steps", "weighted steps"])
@@ -54,15 +55,9 @@ def test_many_tangent_curves_at_once_are_those_one_by_one(steps: bool, feedback:
     minima, forces = solution.descent(a, b), weights.half_gradient(curves)
     for i in range(4):
         minimum, curve = solution.descent(a[i], b[i]), TangentCurve(z=curves.z[i], v=curves.v[i])
-        assert_allclose(minima.z[i], minimum.z, rtol=1e-9, atol=1e-9)
-        assert_allclose(minima.v[i], minimum.v, rtol=1e-9, atol=1e-9)
-        for many, one in zip(forces, weights.half_gradient(curve), strict=True):
+        pairs = zip(forces, weights.half_gradient(curve), strict=True)
+        for many, one in ((minima.z, minimum.z), (minima.v, minimum.v), *pairs):
             assert_allclose(many[i], one, rtol=1e-9, atol=1e-9)
-
-
-def test_recursion_overflows_to_infinity_without_a_warning() -> None:
-    z = LinearRecursion(np.full((400, 1, 1), 10.0)).forward(np.ones(1), np.zeros((400, 1)))
-    assert np.isinf(z[-1, 0])
 
 
 def assert_minimum(cost: Callable[[np.ndarray], float], best: np.ndarray) -> None:
@@ -93,7 +88,7 @@ def test_regulator_gain_minimises_its_cost_over_a_finite_time_varying_horizon() 
 
 @pytest.mark.parametrize("steps", [False, True], ids=["free steps", "weighted steps"])
 @pytest.mark.parametrize("sizes", [(1, 2, 1), (2, 1, 1), (8, 3, 2), (25, 4, 1)])
-def test_weighted_descent_is_the_minimum(sizes: tuple[int, int, int], steps: bool) -> None:
+def test_weighted_descent_is_the_minimum(sizes: Any, steps: bool) -> None:
     N, nx, nu = sizes
     rng = np.random.default_rng(N + 10 * nx)
     A, B = random_system(rng, N, nx, nu)
@@ -105,7 +100,7 @@ def test_weighted_descent_is_the_minimum(sizes: tuple[int, int, int], steps: boo
 
     def cost(v: np.ndarray) -> float:
         z = response(v)
-        return float(np.sum(a * z) + np.sum(b * v)) + 0.5 * form(weights, z, v)
+        return (np.sum(a * z) + np.sum(b * v)) + 0.5 * form(weights, z, v)
 
     zeta = RiccatiSolution.solve(A, B, weights).descent(a, b)
     assert_minimum(cost, zeta.v)
@@ -132,20 +127,6 @@ def test_a_control_weight_that_is_not_positive_is_refused() -> None:
         RiccatiSolution.solve(A, B, Weights.constant(3, flat, flat, flat))
 
 
-@pytest.mark.parametrize("wrong", ["A", "B", "a", "b", "Q", "R"])
-def test_arrays_that_do_not_fit_together_are_refused(wrong: str) -> None:
-    fits = {"A": (6, 3, 3), "B": (6, 3, 2), "a": (7, 3), "b": (6, 2), "Q": (3, 3), "R": (2, 2)}
-    misfits = {"A": (6, 4, 4), "B": (6, 4, 2), "a": (6, 3), "b": (5, 2), "Q": (4, 4), "R": (3, 3)}
-    A, B, a, b, Q, R = (np.ones({**fits, wrong: misfits[wrong]}[name]) for name in fits)
-
-    def descent() -> None:
-        weights = Weights.constant(6, Q, R + np.eye(len(R)), np.eye(3))
-        RiccatiSolution.solve(A, B, weights).descent(a, b)
-
-    with pytest.raises((ValueError, IndexError)):
-        descent()
-
-
 @pytest.mark.parametrize(("rows", "rhs"), [(3, "c"), (5, "c"), (4, "a"), (6, "a")])
 def test_recursion_refuses_arrays_of_the_wrong_length(rows: int, rhs: str) -> None:
     recursion, wrong = LinearRecursion(np.ones((4, 2, 2))), np.ones((rows, 2))
@@ -167,6 +148,7 @@ def test_growth_is_the_largest_amplification_from_the_start_or_to_the_end() -> N
 
 
 def test_growth_in_best_units_counts_neither_drift_nor_slow_oscillation() -> None:
+    """It is that of an unstable motion."""
     # The position of a cart that keeps its speed for 100 s.
     drift = np.tile([[1.0, 0.1], [0.0, 1.0]], (1000, 1, 1))
     assert largest_amplification(drift) > 99.0
@@ -179,8 +161,6 @@ def test_growth_in_best_units_counts_neither_drift_nor_slow_oscillation() -> Non
     assert largest_amplification(swing) > 9.0
     assert amplification_in_best_units(swing) == pytest.approx(2.0, rel=1e-2)
 
-
-def test_growth_in_best_units_is_that_of_an_unstable_motion() -> None:
     # An inverted pendulum, whose deviations grow by a factor of e in 0.3 s.
     rate = 1.0 / 0.3
     cosh, sinh = np.cosh(0.01 * rate), np.sinh(0.01 * rate)

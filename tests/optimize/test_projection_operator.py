@@ -5,7 +5,6 @@ Only the algorithm is tested, without MuJoCo.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import accumulate, pairwise
@@ -17,7 +16,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy.optimize import minimize
 
 from mjfim.optimize import projection_operator
-from mjfim.optimize.directions import LBFGS, MetricDescent
+from mjfim.optimize.directions import LBFGS, MetricDescent, convex_pairs
 from mjfim.optimize.lq import TangentCurve, amplification_in_best_units
 from mjfim.optimize.projection_operator import (
     Armijo,
@@ -28,7 +27,7 @@ from mjfim.optimize.projection_operator import (
     optimize,
 )
 from mjfim.records.design import Status
-from tests.support.numerics import Array, directional_check
+from tests.support.numerics import Array
 
 DT, N = 0.05, 60
 START, GOAL = np.array([0.4, 0.0]), np.array([np.pi, 0.0])
@@ -89,7 +88,7 @@ class Pendulum:
         """The quadratic cost, infinite beyond the wall, less the shift."""
         d, u = point.x - GOAL, point.u
         running = DT * (np.einsum("ki,ij,kj->", d[:-1], Q, d[:-1]) + R[0, 0] * np.sum(u**2))
-        whole = 0.5 * float(running + d[-1] @ TERMINAL @ d[-1])
+        whole = 0.5 * (running + d[-1] @ TERMINAL @ d[-1])
         self.values.append(whole - self.shift if np.abs(u).max() <= self.wall else np.inf)
         return self.values[-1]
 
@@ -168,7 +167,7 @@ def optimum() -> float:
 
     u = start(problem).u[:, 0]
     options = {"gtol": 1e-9, "maxiter": 800}
-    return float(minimize(cost, u, jac=True, method="BFGS", options=options).fun)
+    return minimize(cost, u, jac=True, method="BFGS", options=options).fun
 
 
 DIRECTIONS = {
@@ -186,45 +185,24 @@ def test_the_optimum_does_not_depend_on_how_often_the_regulator_is_renewed(
     assert iterates[-1].status is Status.CONVERGED
     assert iterates[-1].value == pytest.approx(optimum, rel=1e-7)
 
-
-@pytest.mark.parametrize("method", DIRECTIONS)
-def test_the_cost_of_iterates_falls_and_only_the_last_has_a_status(method: str) -> None:
-    iterates = run(Pendulum(), DIRECTIONS[method]())
+    # The cost falls, and only the last iterate has a status.
     assert all(b.value < a.value for a, b in pairwise(iterates))
     assert [i.index for i in iterates] == list(range(len(iterates)))
-    assert [i.status for i in iterates[:-1]] == [None] * (len(iterates) - 1)
+    assert not any(i.status for i in iterates[:-1])
     assert iterates[0].gamma == 0.0
     assert all(0.0 < i.gamma <= 1.0 for i in iterates[1:])
-
-
-@pytest.mark.parametrize("method", DIRECTIONS)
-def test_the_expansion_of_this_problem_is_exact(method: str) -> None:
-    problem = Pendulum()
-    point, expansion, K, zeta = begun(problem, DIRECTIONS[method]())
-    size = 1e-2 / np.abs(zeta.v).max()
-    short = TangentCurve(z=size * zeta.z, v=size * zeta.v)
-
-    def J(t: float) -> float:
-        return problem.value(problem.project(point, short, t, K))
-
-    assert directional_check([expansion.slope(short)], [J], 1.0) < 1e-7
-    assert directional_check([1.001 * expansion.slope(short)], [J], 1.0) > 5e-4
 
 
 def test_convergence_compares_the_slope_with_the_cost() -> None:
     for tolerance in (1e-2, 1e-5):
         iterates = run(Pendulum(), METRIC, tolerance=tolerance)
-        assert iterates[-1].status is Status.CONVERGED
-        assert iterates[-1].slope <= tolerance * iterates[-1].value
-        assert all(i.slope > tolerance * i.value for i in iterates[:-1])
+        assert [i.slope <= tolerance * i.value for i in iterates].index(True) == len(iterates) - 1
 
 
 @pytest.mark.parametrize("limit", [0, 1, 3])
 def test_max_iterations_is_an_outcome_and_counts_accepted_steps(limit: int) -> None:
-    iterates = run(Pendulum(), METRIC, max_iterations=limit)
-    assert iterates[-1].status is Status.MAX_ITERATIONS
-    assert iterates[-1].index == limit
-    assert not iterates[-1].status.success
+    last = run(Pendulum(), METRIC, max_iterations=limit)[-1]
+    assert (last.status, last.index) == (Status.MAX_ITERATIONS, limit)
 
 
 class Wrong(Pendulum):
@@ -241,7 +219,7 @@ class Wrong(Pendulum):
 @pytest.mark.parametrize("refinements", [0, 2])
 @pytest.mark.parametrize("make", [partial(Pendulum, sign=-1.0), Wrong])
 def test_a_wrong_gradient_stalls_and_never_raises_the_cost(
-    make: Callable[..., Pendulum], refinements: int, method: str
+    make: Any, refinements: int, method: str
 ) -> None:
     """Better differences are used before."""
     problem = make(refinements=refinements)
@@ -319,29 +297,19 @@ def test_the_line_search_ends_with_its_time_and_the_descent_with_its_last_iterat
     assert searched(problem, -1.0, Armijo(is_over=lambda: next(asked)))[0] is None
     assert len(problem.values) == 5  # three trials between the start and itself
 
+    # An ascent direction is not called converged.
     iterates = run(Pendulum(), Upwards(), armijo=Armijo(is_over=lambda: True))
     assert [iterate.status for iterate in iterates] == [None]
-
-
-def test_an_ascent_direction_is_not_called_converged() -> None:
     iterates = run(Pendulum(), Upwards(), max_iterations=5)
     assert iterates[-1].status is not Status.CONVERGED
     assert iterates[-1].value <= iterates[0].value
-
-
-def test_descent_continues_after_diverged_trials(optimum: float) -> None:
-    free = run(Pendulum(), LBFGS(R * DT))
-    peak = np.abs(free[-1].point.u).max()
-    problem = Pendulum(wall=1.02 * peak)
-    iterates = run(problem, LBFGS(R * DT))
-    assert iterates[-1].value == pytest.approx(optimum, rel=1e-6)
 
 
 @pytest.mark.parametrize(
     "settings",
     [{"sigma": 0.0}, {"sigma": 0.5}, {"sigma": -1.0}, {"beta": 0.0}, {"beta": 1.0}, {"trials": 0}],
 )
-def test_armijo_refuses_settings_that_cannot_work(settings: dict[str, float]) -> None:
+def test_armijo_refuses_settings_that_cannot_work(settings: Any) -> None:
     with pytest.raises(ValueError, match="Armijo needs"):
         Armijo(**settings)
 
@@ -433,3 +401,11 @@ def test_feedback_only_above_the_threshold_of_amplification(
     monkeypatch.delattr(projection_operator, "amplification_in_best_units")
     assert not gain(np.inf).any()
     assert gain(0.0).any()
+
+
+def test_only_pairs_of_clearly_positive_curvature_are_kept() -> None:
+    s = np.array([[1.0, 0.0], [1.0, 0.0], [0.0, 0.0], [0.0, 2.0]])
+    y = np.array([[3.0, 1.0], [-1.0, 5.0], [1.0, 1.0], [1.0, 1e-9]])
+    kept = convex_pairs(s, y, 1e-8)
+    assert [curvature for _, _, curvature in kept] == [3.0]
+    assert_array_equal(kept[0][1], y[0])

@@ -26,12 +26,12 @@ def points(seed: int) -> Array:
     rng = np.random.default_rng(seed)
     y = 2.0 - 5.0 * T + rng.standard_normal(len(T))
     y[::8] += rng.uniform(8.0, 30.0, len(y[::8]))
-    return np.asarray(y)
+    return y
 
 
 def residuals(x: Array, y: Array) -> Array:
     """Residuals of the points from a line."""
-    return np.asarray(x[0] + x[1] * T - y)
+    return x[0] + x[1] * T - y
 
 
 def reweighted(loss: RobustLoss, y: Array) -> Array:
@@ -40,7 +40,7 @@ def reweighted(loss: RobustLoss, y: Array) -> Array:
     for _ in range(2000):
         w = loss.weight(residuals(x, y))
         x = x - np.linalg.lstsq(A * w[:, None], residuals(x, y) * w)[0]
-    return np.asarray(x)
+    return x
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -73,14 +73,6 @@ def test_the_weight_follows_from_the_value(kind: Kind) -> None:
     assert_array_equal(loss.weight(np.zeros(3)), 1.0)
 
 
-def test_losses_equal_the_square_near_zero_and_huber_to_its_scale() -> None:
-    for kind in KINDS:
-        assert RobustLoss(kind=kind).value(np.full(5, 1e-4)) == pytest.approx(5e-8, rel=1e-6)
-    huber = RobustLoss(kind="huber", scale=3.0)
-    assert_array_equal(huber.weight(np.array([-3.0, 0.0, 2.9, 3.0])), 1.0)
-    assert huber.weight(np.array([3.3]))[0] < 1.0
-
-
 @pytest.mark.parametrize("scale", [1.0, 3.0, 4.5])
 def test_the_mean_square_of_inliers(scale: float) -> None:
     """Compare with a million normal numbers; a linear loss has no outliers."""
@@ -89,5 +81,5 @@ def test_the_mean_square_of_inliers(scale: float) -> None:
         loss = RobustLoss(kind=kind, scale=scale)
         assert loss.outlier_threshold == (np.inf if kind == "linear" else max(scale, 3.0))
         assert loss.inlier_mean_square == pytest.approx(
-            float(np.mean(r[np.abs(r) <= loss.outlier_threshold] ** 2)), rel=5e-3
+            np.mean(r[np.abs(r) <= loss.outlier_threshold] ** 2), rel=5e-3
         )

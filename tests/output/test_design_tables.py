@@ -61,7 +61,7 @@ def closed_loop(path: Path, folder: Path, push: Array) -> tuple[Array, Array, Ar
     """
     rows = read_rows(path)
     model = mujoco.MjModel.from_xml_path(str(folder / "model.xml"))
-    data, layout, nv = mujoco.MjData(model), Layout.of(model), model.nv
+    data, layout, nv = mujoco.MjData(model), Layout(model), model.nv
     steps = round(rows[1]["t"] / model.opt.timestep)
     data.qpos[:], qvel, act = layout.planned(rows[0])
     data.qvel[:], data.act[:] = qvel + push[nv : 2 * nv], act + push[2 * nv :]

@@ -26,10 +26,17 @@ from mjfim.parallel.budget import StopToken, measured_by
 from mjfim.records.events import Event, StudyEvent
 from mjfim.records.studies import DESIGN, Comparison, MethodOutcome, MethodResult
 from mjfim.studies.compare import chosen_methods
-from tests.support.baselines import pendulum
+from tests.support.cart_pendulum import cart_pendulum
 from tests.support.cli import MODELS, loads, names, read, run, write_experiment
 from tests.support.limits import excess_of
 from tests.support.made_records import make_comparison, make_method_result
+
+# The cart-pendulum over two seconds under hard limits, without weights.
+PENDULUM = cart_pendulum(
+    horizon=2.0,
+    limits={"control": {"force": (-5.0, 5.0)}, "position": {"slide": (-0.5, 0.5)}},
+    cost={"control": 0.0, "tracking": {}},
+)
 
 LIMITS = "\n[limits]\ncontrol = { force = [-5.0, 5.0] }\nposition = { slide = [-0.5, 0.5] }\n"
 
@@ -68,8 +75,8 @@ def test_rows_hold_the_numbers_of_their_controls(monkeypatch: pytest.MonkeyPatch
     # Seconds of the processor, so that a busy computer decides nothing.
     monkeypatch.delattr(design_module, "identifiability_along")
     with measured_by(time.process_time):
-        found = mjfim.compare(pendulum(), seconds=1.0, seed=1, methods=["chirp", "fourier5"])
-    task = DesignTask.resolve(pendulum())
+        found = mjfim.compare(PENDULUM, seconds=1.0, seed=1, methods=["chirp", "fourier5"])
+    task = DesignTask.resolve(PENDULUM)
     assert [r.method for r in found.rows] == ["chirp", "fourier5", DESIGN]
     assert not found.interrupted
     assert found.rows[0].seconds >= 0.95
@@ -120,7 +127,7 @@ def test_logarithms_are_compared_by_their_difference() -> None:
 
 
 def test_only_applicable_methods_are_run() -> None:
-    hard = DesignTask.resolve(pendulum()).system
+    hard = DesignTask.resolve(PENDULUM).system
     assert chosen_methods(hard, None)[:2] == ("chirp", "multisine")
     assert chosen_methods(hard, ["steps", "design", "steps"]) == ("steps",)
     with pytest.raises(ExperimentError, match="did you mean 'chirp'"):
@@ -136,7 +143,7 @@ def test_a_request_to_stop_keeps_finished_methods_and_the_best_of_the_last() -> 
             token.request()
 
     c = mjfim.compare(
-        pendulum(),
+        PENDULUM,
         seconds=2.0,
         methods=["chirp", "steps"],
         callback=stop_in_the_second_method,
@@ -151,7 +158,7 @@ def test_a_request_to_stop_keeps_finished_methods_and_the_best_of_the_last() -> 
 @pytest.mark.parametrize("budget", [{"seconds": 0.0}, {"seconds": np.inf}])
 def test_budgets_must_be_positive(budget: dict[str, float]) -> None:
     with pytest.raises(ExperimentError, match="positive"):
-        mjfim.compare(pendulum(), **budget)
+        mjfim.compare(PENDULUM, **budget)
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ from tests.support.paths import MODELS
 
 # A short study of the same model as Python states it.
 MODEL = MODELS / "cart_pendulum.xml"
-STATED: dict[str, Any] = {
+STATED = {
     "model": MODEL,
     "rate": 50.0,
     "horizon": 0.4,

@@ -148,8 +148,7 @@ def write_experiment(home: Path, **lines: str) -> Path:
 
 def loads(text: str) -> dict[str, Any]:
     """Parse a JSON object."""
-    found: dict[str, Any] = json.loads(text)
-    return found
+    return json.loads(text)
 
 
 def read(path: Path) -> dict[str, Any]:

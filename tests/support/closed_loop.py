@@ -6,8 +6,8 @@ It shares no code with `mjfim.plant.closed_loop`.
 from __future__ import annotations
 
 import math
+from collections.abc import Generator
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import mujoco
@@ -15,8 +15,9 @@ import numpy as np
 from scipy.interpolate import CubicHermiteSpline
 
 import mjfim
+from tests.support.paths import MODELS
 
-ARM = Path(__file__).resolve().parents[2] / "models" / "two_joint_arm.xml"
+ARM = MODELS / "two_joint_arm.xml"
 
 
 @dataclass
@@ -51,10 +52,10 @@ def command(t: float, values: np.ndarray, dt: float, width: float) -> float:
 
     def at(x: float) -> float:
         if x < 0.0:
-            return float(values[0] * x)
+            return values[0] * x
         if x > edges[-1]:
-            return float(integral[-1] + values[-1] * (x - edges[-1]))
-        return float(np.interp(x, edges, integral))
+            return integral[-1] + values[-1] * (x - edges[-1])
+        return np.interp(x, edges, integral)
 
     return (at(t + width) - at(t)) / width
 
@@ -71,20 +72,20 @@ def simulate(
 
     laws: by the number of the actuator. columns: of each actuator, by quantity, or "ctrl".
     """
-    h = float(model.opt.timestep)
+    h = model.opt.timestep
     substeps = round(dt / h)
     data = mujoco.MjData(model)
     data.qpos[:], data.qvel[:], data.act[:] = np.split(start, [model.nq, model.nq + model.nv])
 
-    states, controls = [np.array(start)], []
-    memory: dict[int, dict[str, Any]] = {}
+    def measured(law: PlainLaw) -> tuple[float, float]:
+        """Position and velocity of the joint of a law."""
+        joint = data.joint(law.joint)
+        return joint.qpos[0], joint.qvel[0]
+
+    states, controls, running = [np.array(start)], [], {}
     for a, law in laws.items():
-        q = float(data.joint(law.joint).qpos[0])
-        v = float(data.joint(law.joint).qvel[0])
-        memory[a] = {"t": [-1.0, 0.0], "q": [q - v, q], "v": [v, v]}
-        memory[a] |= {"held": None, "integral": law.integral, "filtered": None}
-        memory[a] |= {"profile": None}
-        memory[a] |= {"last": q - v * (law.tick * h + law.feedback_latency), "vf": v, "r": None}
+        running[a] = controls_of(law, columns[a], measured(law), dt, h)
+        next(running[a])
 
     for step in range(samples * substeps):
         for a, signals in columns.items():
@@ -92,10 +93,7 @@ def simulate(
                 data.ctrl[a] = signals["ctrl"][step // substeps]
         for a, law in laws.items():
             if step % law.tick == 0:
-                q, v = (
-                    float(x[0]) for x in (data.joint(law.joint).qpos, data.joint(law.joint).qvel)
-                )
-                data.ctrl[a] = evaluate(law, memory[a], columns[a], step * h, (q, v), dt, h)
+                data.ctrl[a] = running[a].send((step * h, *measured(law)))
         controls.append(np.array(data.ctrl))
         mujoco.mj_step(model, data)
         if (step + 1) % substeps == 0:
@@ -103,92 +101,92 @@ def simulate(
     return np.array(states), np.array(controls)
 
 
-def evaluate(
-    law: PlainLaw,
-    memory: dict[str, Any],
-    signals: dict[str, np.ndarray],
-    t: float,
-    state: tuple[float, float],
-    dt: float,
-    h: float,
-) -> float:
-    """Control of one law at one tick."""
+def controls_of(
+    law: PlainLaw, signals: dict[str, np.ndarray], start: tuple[float, float], dt: float, h: float
+) -> Generator[float, tuple[float, float, float], None]:
+    """The control of one law at each tick, to which time, position and velocity are sent."""
     T = law.tick * h
     width = dt if law.linear else min(T, dt)
     share = 1.0 - math.exp(-T / law.time_constant) if law.time_constant else 1.0
+    rows = signals["reference"]
 
-    r = command(t - law.latency, signals["reference"], dt, width)
-    previous = r if memory["filtered"] is None else memory["filtered"]
-    filtered = previous + share * (r - previous)
-    memory["filtered"] = filtered
-    if math.isfinite(law.acceleration):
-        p, s = memory["profile"] or (filtered, 0.0)
-        # The latest row of the log that counts at this tick; a jump counts at two ticks.
-        rows = signals["reference"]
-        latest = math.ceil((t - law.latency + width) / dt - 1e-9) - 1
-        row = float(rows[min(max(latest, 0), len(rows) - 1)])
-        has_jumped = abs(row - memory.get("row", row)) > law.jump
-        is_jump = has_jumped or memory.get("jumped", False)
-        memory["row"], memory["jumped"] = row, has_jumped
-        if is_jump:
-            p, s = filtered, 0.0
-        else:
-            e, a = filtered - p, law.acceleration
-            # The fastest velocity from which a T per tick brakes to zero at the reference.
-            braking = math.sqrt((a * T / 2) ** 2 + 2 * a * abs(e)) - a * T / 2
-            target = math.copysign(min(braking, abs(e) / T), e)
-            s = min(max(target, s - a * T), s + a * T)
-            p += T * s
-        previous = p if memory["profile"] is None else memory["profile"][0]
-        memory["profile"], filtered = (p, s), p
-    velocity = 0.0
-    if law.reference_difference:
-        velocity = (filtered - previous) / T
-    elif "reference_velocity" in signals:
-        rv = command(t - law.latency, signals["reference_velocity"], dt, width)
-        before = rv if memory["r"] is None else memory["r"]
-        velocity = memory["r"] = before + share * (rv - before)
+    # What is known before the first tick: the joint has always moved at its first velocity.
+    q, v = start
+    times, positions, velocities = [-1.0, 0.0], [q - v, q], [v, v]
+    last_position = q - v * (T + law.feedback_latency)
+    filtered_velocity, integral = v, law.integral
+    filtered = profile = last_row = held = reference_velocity = None
+    speed, has_jumped, u = 0.0, False, 0.0
 
-    q, v = state
-    if t > 0.0:
-        for key, value in (("t", t), ("q", q), ("v", v)):
-            memory[key].append(value)
-    past = t - law.feedback_latency
-    q = float(CubicHermiteSpline(memory["t"], memory["q"], memory["v"])(past))
-    v = float(np.interp(past, memory["t"], memory["v"]))
-    if law.difference:
-        v, memory["last"] = (q - memory["last"]) / T, q
-    if law.velocity_time_constant:
-        memory["vf"] += (1.0 - math.exp(-T / law.velocity_time_constant)) * (v - memory["vf"])
-        v = memory["vf"]
+    while True:
+        t, q, v = yield u
+        r = command(t - law.latency, rows, dt, width)
+        previous = r if filtered is None else filtered
+        filtered = reference = previous + share * (r - previous)
+        if math.isfinite(law.acceleration):
+            is_first = profile is None
+            before = reference if is_first else profile
+            # The latest row of the log that counts at this tick; a jump counts at two ticks.
+            latest = math.ceil((t - law.latency + width) / dt - 1e-9) - 1
+            row = rows[min(max(latest, 0), len(rows) - 1)]
+            jumps = last_row is not None and abs(row - last_row) > law.jump
+            if jumps or has_jumped:
+                profile, speed = reference, 0.0
+            else:
+                e, a = reference - before, law.acceleration
+                # The fastest velocity from which a T per tick brakes to zero at the reference.
+                braking = math.sqrt((a * T / 2) ** 2 + 2 * a * abs(e)) - a * T / 2
+                target = math.copysign(min(braking, abs(e) / T), e)
+                speed = min(max(target, speed - a * T), speed + a * T)
+                profile = before + T * speed
+            last_row, has_jumped = row, jumps
+            previous, reference = profile if is_first else before, profile
+        velocity = 0.0
+        if law.reference_difference:
+            velocity = (reference - previous) / T
+        elif "reference_velocity" in signals:
+            rv = command(t - law.latency, signals["reference_velocity"], dt, width)
+            before = rv if reference_velocity is None else reference_velocity
+            velocity = reference_velocity = before + share * (rv - before)
 
-    sample = min(int(t / dt + 1e-9), len(signals["reference"]) - 1)
-    gain = float(signals["gain"][sample]) if "gain" in signals else 1.0
-    step = gain * law.ki * T * (filtered - q)
-    limit = law.integral_limit
-    memory["integral"] = min(max(memory["integral"] + step, -limit), limit)
+        if t > 0.0:
+            times.append(t)
+            positions.append(q)
+            velocities.append(v)
+        past = t - law.feedback_latency
+        q = CubicHermiteSpline(times, positions, velocities)(past)
+        v = np.interp(past, times, velocities)
+        if law.difference:
+            v, last_position = (q - last_position) / T, q
+        if law.velocity_time_constant:
+            decay = math.exp(-T / law.velocity_time_constant)
+            v = filtered_velocity = v + decay * (filtered_velocity - v)
 
-    u = gain * (law.kp * (filtered - q) + law.kd * (velocity - v)) + memory["integral"]
-    if "feedforward" in signals:
-        u += command(t - law.latency, signals["feedforward"], dt, width)
-    u = min(max(u, law.low), law.high)
-    if memory["held"] is not None:
-        change = law.slew * T
-        u = min(max(u, memory["held"] - change), memory["held"] + change)
-    if "enable" in signals and signals["enable"][sample] < 0.5:
-        u, memory["integral"] = 0.0, 0.0
-    memory["held"] = u
-    return float(u)
+        sample = min(int(t / dt + 1e-9), len(rows) - 1)
+        gain = signals["gain"][sample] if "gain" in signals else 1.0
+        limit = law.integral_limit
+        integral = min(max(integral + gain * law.ki * T * (reference - q), -limit), limit)
+
+        u = gain * (law.kp * (reference - q) + law.kd * (velocity - v)) + integral
+        if "feedforward" in signals:
+            u += command(t - law.latency, signals["feedforward"], dt, width)
+        u = min(max(u, law.low), law.high)
+        if held is not None:
+            change = law.slew * T
+            u = min(max(u, held - change), held + change)
+        if "enable" in signals and signals["enable"][sample] < 0.5:
+            u, integral = 0.0, 0.0
+        held = u
 
 
 def arm_experiment(controllers: dict[str, Any], **tables: Any) -> mjfim.Experiment:
     """The two-joint arm with laws, at 500 Hz on an engine at 1 kHz."""
-    values: dict[str, Any] = {
+    values = {
         "model": str(ARM),
         "rate": 500.0,
         "initial": {"keyframe": "hanging"},
         "noise": {"state": 1e-4},
-        "parameters": {"damping": {"target": "joint/shoulder:damping"}},
+        "parameters": {"damping": "joint/shoulder:damping"},
         "controllers": controllers,
     }
     return mjfim.Experiment(**{**values, **tables})

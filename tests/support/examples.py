@@ -6,51 +6,39 @@ of designs add them.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 
 from tests.support.paths import MODELS
 
+TOLERANCE = "[descent]\ntolerance = 1e-2\n"
 
-@dataclass(frozen=True, kw_only=True)
-class DesignTables:
-    """TOML that makes an experiment for identification one that can be designed.
-
-    Attributes:
-        horizon: Duration of the design [s].
-        control: Initial control.
-        tables: Further tables.
-    """
-
-    horizon: float
-    control: str
-    tables: str = "[descent]\ntolerance = 1e-2\n"
-
-
-# Additions to the experiments that state none.
+# What is added to the experiments for identification: the duration of the design [s], the initial
+# control, and further tables.
 DESIGN_TABLES = {
-    "dfki_simple_pendulum": DesignTables(
-        horizon=2.0,
-        control='{ kind = "chirp", amplitude = 1.2, frequency = 0.4, frequency_end = 1.5 }',
-        tables="[cost]\ncontrol = 1e-3\n\n[descent]\ntolerance = 1e-2\n",
+    "dfki_simple_pendulum": (
+        2.0,
+        '{ kind = "chirp", amplitude = 1.2, frequency = 0.4, frequency_end = 1.5 }',
+        f"[cost]\ncontrol = 1e-3\n\n{TOLERANCE}",
     ),
-    "dfki_double_pendulum": DesignTables(
-        horizon=2.5,
-        control='{ kind = "chirp", amplitude = { shoulder = 0.6, elbow = 0.4 }, '
+    "dfki_double_pendulum": (
+        2.5,
+        '{ kind = "chirp", amplitude = { shoulder = 0.6, elbow = 0.4 }, '
         "frequency = 0.4, frequency_end = 2.0 }",
+        TOLERANCE,
     ),
     # The goal (pull) swings at kp = 100. The brake grows and fades, which separates it from
     # damping.
-    "bam_xl330": DesignTables(
-        horizon=6.0,
-        control='{ kind = "sine", amplitude = { pull = 2.0, brake = 0.5 }, '
+    "bam_xl330": (
+        6.0,
+        '{ kind = "sine", amplitude = { pull = 2.0, brake = 0.5 }, '
         "offset = { stiffness = 2.1286, brake = 0.5 }, frequency = 0.6 }",
+        TOLERANCE,
     ),
-    "two_joint_arm": DesignTables(
-        horizon=4.0,
-        control='{ kind = "multisine", amplitude = { shoulder = 8.0, elbow = 3.0 }, '
+    "two_joint_arm": (
+        4.0,
+        '{ kind = "multisine", amplitude = { shoulder = 8.0, elbow = 3.0 }, '
         "frequency = 0.3, harmonics = 8 }",
-        tables="",
+        "",
     ),
 }
 
@@ -66,10 +54,10 @@ def design_file(name: str, folder: Path) -> Path:
     if name not in DESIGN_TABLES:
         return file
 
-    added = DESIGN_TABLES[name]
+    horizon, control, tables = DESIGN_TABLES[name]
     text = file.read_text(encoding="utf-8")
     text = text.replace('model = "', f'model = "{MODELS.as_posix()}/')
-    text = text.replace("\n[initial]\n", f"\n[initial]\ncontrol = {added.control}\n")
+    text = text.replace("\n[initial]\n", f"\n[initial]\ncontrol = {control}\n")
     target = folder / file.name
-    target.write_text(f"horizon = {added.horizon}\n{text}\n{added.tables}", encoding="utf-8")
+    target.write_text(f"horizon = {horizon}\n{text}\n{tables}", encoding="utf-8")
     return target

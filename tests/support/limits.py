@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ from mjfim.excitation.limits.constraint_kinds import ConstraintValues
 from mjfim.excitation.limits.constraints import ConstraintSet, constraint_set_of
 from mjfim.excitation.search.interior_problem import InteriorProblem
 from mjfim.excitation.task import DesignTask
-from tests.fuzz.player import NEAREST, Layout, model_with_force_sensors, play
+from tests.fuzz.player import NEAREST, Layout, play
 from tests.support.numerics import Array, cart_task, directional_check, make_task
 
 # An arm of two servos on a floating hull: the addresses of positions, velocities, joints and
@@ -70,12 +71,9 @@ def floating_task(folder: Path, integrator: str = "implicitfast", **tables: Any)
         "offset": {"thrust": 3.0, "shoulder": 0.2, "elbow": 0.1},
         "frequency": 2.0,
     }
-    defaults: dict[str, Any] = {
+    defaults = {
         "horizon": 0.3,
-        "parameters": {
-            "m": {"target": "body/fore:mass"},
-            "c": {"target": "joint/shoulder:damping"},
-        },
+        "parameters": {"m": "body/fore:mass", "c": "joint/shoulder:damping"},
         "noise": {"qpos:shoulder": 0.01, "qpos:elbow": 0.01, "qvel:elbow": 0.05},
         "limits": FLOATING_LIMITS,
         "initial": {
@@ -112,6 +110,15 @@ ARM = """
 """
 
 
+def arm_task(folder: Path, model: str = ARM, **tables: Any) -> DesignTask:
+    """The arm at rest for half a second, whose joints are measured."""
+    defaults = {
+        "parameters": {"m": "body/fore:mass", "c": "joint/elbow:damping"},
+        "noise": {"qpos:shoulder": 0.01, "qpos:elbow": 0.01},
+    }
+    return make_task(model, folder, **{**defaults, **tables})
+
+
 def played(model: Any, start: tuple[Array, Array], ctrl: Array, substeps: int) -> dict[str, Array]:
     """Positions, velocities, accelerations and actuator forces at every step of a plain loop."""
     data, rows = mujoco.MjData(model), []
@@ -131,12 +138,11 @@ def directions_of(task: DesignTask, count: int, seed: int = 0) -> Array:
     t = task.t[:, None] / task.experiment.horizon
     nu = task.control.shape[1]
 
+    count, rest, phases = count // 2, count - count // 2, 2 * np.pi * t
     smooth = [
-        np.sin(2 * np.pi * rng.uniform(0.5, 3.0, nu) * t + rng.uniform(0, 6, nu))
-        for _ in range(count // 2)
+        np.sin(phases * rng.uniform(0.5, 3.0, nu) + rng.uniform(0, 6, nu)) for _ in range(count)
     ]
-    rough = rng.normal(size=(count - count // 2, *task.control.shape))
-    return np.array([*smooth, *rough])
+    return np.array([*smooth, *rng.normal(size=(rest, *task.control.shape))])
 
 
 def along_control(
@@ -159,16 +165,21 @@ def barrier_problem(task: DesignTask, delta: float, **changes: Any) -> InteriorP
     return InteriorProblem(base=task.problem, delta=delta, **stated)
 
 
-def barrier_check(task: DesignTask, delta: float, h: float = 2e-5) -> float:
+def slope_check(
+    task: DesignTask, gradient: Array, value: Callable[[Array], float], ways: Array, h: float
+) -> float:
+    """Largest relative error of a gradient (N, nu) against differences of a value of controls."""
+    curves = [lambda s, way=way: value(task.control + s * way) for way in ways]
+    return directional_check([np.sum(gradient * way) for way in ways], curves, h)
+
+
+def barrier_check(task: DesignTask, delta: float) -> float:
     """Largest relative error of the slope of the barrier, against differences of simulations."""
     problem = barrier_problem(task, delta)
     expansion = problem.expand(problem.point(task.control))
-    open_loop = np.zeros((task.samples, len(task.controls), task.space.nx))
-    gradient = expansion.gradient(open_loop)
-    sizes = np.abs(task.control - task.centre).max(axis=0)
-    ways = directions_of(task, 6) * sizes
-    curves = [lambda s, way=way: problem.point(task.control + s * way).barrier for way in ways]
-    return directional_check([float(np.sum(gradient * way)) for way in ways], curves, h)
+    gradient = expansion.gradient(np.zeros((task.samples, len(task.controls), task.space.nx)))
+    ways = directions_of(task, 6) * np.abs(task.control - task.centre).max(axis=0)
+    return slope_check(task, gradient, lambda ctrl: problem.point(ctrl).barrier, ways, 2e-5)
 
 
 def excess_of(task: DesignTask, ctrl: Array) -> dict[tuple[str, str], float]:
@@ -178,11 +189,8 @@ def excess_of(task: DesignTask, ctrl: Array) -> dict[tuple[str, str], float]:
     end that is not free is the initial state. What a clearance lacks is relative to it.
     """
     stated = task.experiment
-    spec = mujoco.MjSpec.from_file(str(stated.directory / stated.model))
-    for sensor in list(spec.sensors):
-        spec.delete(sensor)
-    model = model_with_force_sensors(spec)
-    layout = Layout.of(model)
+    model = mujoco.MjModel.from_xml_path(str(stated.directory / stated.model))
+    layout = Layout(model)
     columns = itertools.chain.from_iterable(layout.columns)
     start = dict(zip(columns, task.plant.nominal_initial_state.tolist(), strict=True))
     rows = [
@@ -217,7 +225,7 @@ HARD = {
 
 def cart_inside(folder: Path, **tables: Any) -> DesignTask:
     """The cart-pendulum over one second under the limits `HARD`, without weights."""
-    defaults: dict[str, Any] = {
+    defaults = {
         "horizon": 1.0,
         "cost": {"control": 0.0},
         "limits": HARD,

@@ -17,7 +17,7 @@ from mjfim.records.design import (
 )
 from mjfim.records.estimate import Estimate
 from mjfim.records.trajectory import Recording, Trajectory
-from tests.support.made_records import falling, make_row, plain_labels
+from tests.support.made_records import bare_estimate, falling, make_row, plain_labels
 from tests.support.paths import ROOT, SHARED_MODELS
 
 MODELS = {
@@ -160,20 +160,16 @@ def estimated(model: mujoco.MjModel, trajectory: Trajectory) -> Estimate:
         Recording(t=trajectory.t, ctrl=trajectory.ctrl, y=y, outputs=outputs, name=f"run {k}")
         for k in range(2)
     )
-    return Estimate(
-        parameters=("mass", "gear/ratio"),
-        labels=plain_labels(("mass", "gear/ratio")),
-        theta=np.array([2.0, 1.0]),
-        std=np.array([0.1, 0.2]),
-        covariance=np.diag([0.01, 0.04]),
+    return bare_estimate(
+        ("mass", "gear/ratio"),
+        np.array([2.0, 1.0]),
+        np.array([0.1, 0.2]),
         initial_theta=np.array([2.5, 1.4]),
         chi2=500.0,
         dof=80,
         status="the residuals no longer fall",
-        converged=True,
         misfit=True,
-        iterations=4,
-        residual_rms={"qpos:slide": 0.01, "hinge_angle": 0.01},
+        residual_rms=dict.fromkeys(outputs, 0.01),
         at_bound=("mass",),
         predicted=(predicted, predicted),
         recordings=recordings,

@@ -49,29 +49,31 @@ def make_labels(dofs: int, count: int, width: int = 0) -> Labels:
 def falling(std: Array, t: Array) -> Array:
     """Standard deviations that fall like the root of the time (n,) to the last ones: (n, p)."""
     with np.errstate(divide="ignore"):
-        return np.asarray(std * np.sqrt(t[-1] / t)[:, None])
+        return std * np.sqrt(t[-1] / t)[:, None]
 
 
-def make_evaluation(dofs: int, count: int, size: float) -> Evaluation:
+def make_evaluation(
+    dofs: int, count: int, size: float, samples: int = 50, speed: float = 1.0
+) -> Evaluation:
     """Make sinusoids of the given size; a larger motion is more informative."""
-    t = np.asarray(np.linspace(0.0, 2.0, 51), dtype=np.float64)
-    waves = size * np.sin(np.outer(t, 1.0 + np.arange(dofs)))
-    control = np.asarray(size * np.cos(t[:-1, None]), dtype=np.float64)
+    t = np.linspace(0.0, 2.0, samples + 1)
+    waves = size * np.sin(speed * np.outer(t, 1.0 + np.arange(dofs)))
     curve = Trajectory(
-        t=t, qpos=waves, qvel=np.gradient(waves, t, axis=0), act=np.zeros((51, 0)), ctrl=control
+        t=t,
+        qpos=waves,
+        qvel=np.gradient(waves, t, axis=0),
+        act=np.zeros((samples + 1, 0)),
+        ctrl=size * np.cos(t[:-1, None]),
     )
-    psi = size * np.sin(np.multiply.outer(t, 1.0 + np.arange(2 * dofs * count))).reshape(
-        51, 2 * dofs, count
-    )
-    eigenvalues = np.asarray(size**2 * (1.0 + np.arange(count)), dtype=np.float64)
     std = 0.1 / size / np.sqrt(1.0 + np.arange(count))
+    phases = np.multiply.outer(t, 1.0 + np.arange(2 * dofs * count))
     criterion = 1.0 / size**2
     return Evaluation(
         trajectory=curve,
-        gain=np.zeros((50, 1, 2 * dofs)),
-        sensitivity=psi,
+        gain=np.zeros((samples, 1, 2 * dofs)),
+        sensitivity=size * np.sin(phases).reshape(-1, 2 * dofs, count),
         information=np.diag(std**-2),
-        eigenvalues=eigenvalues,
+        eigenvalues=size**2 * (1.0 + np.arange(count)),
         std=std,
         std_over_time=falling(std, t),
         criterion=criterion,
@@ -81,17 +83,8 @@ def make_evaluation(dofs: int, count: int, size: float) -> Evaluation:
 
 def make_row(**changes: object) -> HistoryRow:
     """Make an iterate whose numbers are one, with other values of some fields."""
-    row = HistoryRow(
-        iteration=0,
-        cost=1.0,
-        criterion=1.0,
-        min_eigenvalue=1.0,
-        slope=1.0,
-        gamma=1.0,
-        seconds=0.0,
-        steps=0,
-    )
-    return replace(row, **changes)
+    ones = dict.fromkeys(("cost", "criterion", "min_eigenvalue", "slope", "gamma"), 1.0)
+    return HistoryRow(**{**ones, "iteration": 0, "seconds": 0.0, "steps": 0, **changes})
 
 
 def ten_iterates() -> tuple[HistoryRow, ...]:
@@ -186,7 +179,7 @@ def make_study(count: int = 3, failed: int = 5) -> MonteCarloStudy:
 
 def bare_estimate(parameters: Sequence[str], theta: Array, std: Array, **changes: Any) -> Estimate:
     """An estimate that converged with independent errors, from no recording."""
-    fields: dict[str, Any] = {
+    fields = {
         "parameters": tuple(parameters),
         "labels": plain_labels(parameters),
         "theta": theta,

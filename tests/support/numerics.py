@@ -174,7 +174,7 @@ def body_task(folder: Path, integrator: str = "RK4", **tables: Any) -> DesignTas
     spin = (0.2, -0.1, 0.3, 0.8, -0.5, 0.6, -0.4, 0.7, 0.3)
     tilt = np.array([0.9, 0.3, -0.2, 0.1]) / np.linalg.norm([0.9, 0.3, -0.2, 0.1])
     control = {"kind": "sine", "amplitude": 1.5, "frequency": 1.3, "offset": 0.4}
-    qpos = (0.0, 0.0, 1.0, *(float(v) for v in tilt), 0.8, 0.6, 0.0, 0.0)
+    qpos = (0.0, 0.0, 1.0, *(v for v in tilt), 0.8, 0.6, 0.0, 0.0)
     defaults = {
         "parameters": BODY_PARAMETERS,
         "initial": {"qpos": qpos, "qvel": spin, "control": control},
@@ -266,13 +266,13 @@ def directional_check(
         h: Step of the differences.
     """
     measured = np.array([richardson(f, h) for f in curves])
-    return float(np.abs(np.array(slopes) - measured).max() / np.abs(measured).max())
+    return np.abs(np.array(slopes) - measured).max() / np.abs(measured).max()
 
 
 def relative_error(value: Array, reference: Array) -> float:
     """Largest deviation, relative to the largest reference entry."""
     assert value.shape == reference.shape
-    return float(np.abs(value - reference).max() / np.abs(reference).max())
+    return np.abs(value - reference).max() / np.abs(reference).max()
 
 
 def independent_noise(sigma: Sequence[float] | Array, stride: int = 1) -> Noise:

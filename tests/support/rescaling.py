@@ -22,23 +22,11 @@ import numpy as np
 from mjfim.experiment.schema import Experiment
 from mjfim.records.trajectory import Recording
 
-# Exponents of length, mass and time of the symbols in the package's units; angles have none.
-SYMBOLS = {
-    "": (0, 0, 0),
-    "1": (0, 0, 0),
-    "rad": (0, 0, 0),
-    "m": (1, 0, 0),
-    "kg": (0, 1, 0),
-    "s": (0, 0, 1),
-    "Hz": (0, 0, -1),
-    "N": (1, 1, -2),
-    "Pa": (-1, 1, -2),
-}
-POWERS = {"²": 2, "³": 3}
+POWERS = {"": 1, "²": 2, "³": 3}
 
 # Units of the attributes of MJCF elements, by element; "*" is any element. Q stands for the unit of
 # the coordinate of a joint, and F for the unit of the force on it.
-ATTRIBUTES: dict[str, dict[str, str]] = {
+ATTRIBUTES = {
     "*": {"pos": "m", "fromto": "m", "mass": "kg", "margin": "m", "gap": "m"},
     "option": {"timestep": "s", "gravity": "m/s²", "wind": "m/s", "density": "kg/m³"},
     "inertial": {"diaginertia": "kg m²", "fullinertia": "kg m²"},
@@ -128,19 +116,25 @@ class Units:
             coordinate: Unit of the coordinate Q of a joint, "m" or "rad".
             control: Factor of the control U of an actuator.
         """
-        value = 1.0
-        above, *below = unit.split("/")
-        own = {"Q": [coordinate], "F": ["N"] if coordinate == "m" else ["N", "m"]}
-        for sign, part in ((1, above), *((-1, part) for part in below)):
-            for symbol in re.split(r"[ ·]+", part.strip()):
-                power = POWERS.get(symbol[-1:], 1) * sign
-                base = symbol.rstrip("²³")
-                if base == "U":
-                    value *= control**power
-                    continue
-                for each in own.get(base, [base]):
-                    length, mass, time = (power * exponent for exponent in SYMBOLS[each])
-                    value *= self.length**length * self.mass**mass * self.time**time
+        force = self.mass * self.length / self.time**2
+        sizes = {
+            "m": self.length,
+            "kg": self.mass,
+            "s": self.time,
+            "Hz": 1.0 / self.time,
+            "rad": 1.0,
+            "N": force,
+            "Pa": force / self.length**2,
+            "U": control,
+        }
+        sizes["Q"] = sizes[coordinate]
+        sizes["F"] = force if coordinate == "m" else force * self.length
+        value, sign = 1.0, 1
+        for symbol, power in re.findall(r"([A-Za-z]+|/)([²³]?)", unit):
+            if symbol == "/":
+                sign = -1
+            else:
+                value *= sizes[symbol] ** (sign * POWERS[power])
         return value
 
 

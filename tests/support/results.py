@@ -34,16 +34,18 @@ from mjfim.records.studies import (
     DESIGN,
     Comparison,
     MethodOutcome,
-    MethodResult,
     MonteCarloStudy,
     TrialStatistics,
 )
 from mjfim.records.terms import Term, TermNumber
-from mjfim.records.trajectory import Labels, Recording, Trajectory
+from mjfim.records.trajectory import Labels, Recording
 from mjfim.records.worth import Price, SensorWorth, Watch, Worth
 from tests.support.made_records import (
     bare_estimate,
     falling,
+    make_comparison,
+    make_evaluation,
+    make_method_result,
     make_recording_comparison,
     ten_iterates,
 )
@@ -91,31 +93,19 @@ def covariance(std: Array) -> Array:
     """Covariance with these standard deviations, in which the first two are correlated."""
     correlation = np.eye(len(std))
     correlation[0, 1] = correlation[1, 0] = CORRELATION
-    return np.asarray(correlation * np.outer(std, std))
+    return correlation * np.outer(std, std)
 
 
 def evaluation(size: float, samples: int) -> Evaluation:
     """A sinusoid of a given size; a larger one tells more."""
-    t = np.linspace(0.0, 2.0, samples + 1)
-    wave = size * np.sin(6.0 * t)[:, None]
-    trajectory = Trajectory(
-        t=t,
-        qpos=wave,
-        qvel=6.0 * size * np.cos(6.0 * t)[:, None],
-        act=np.zeros((samples + 1, 0)),
-        ctrl=size * np.cos(t[:-1, None]),
-    )
-    std = 0.01 / size * THETA
-    return Evaluation(
-        trajectory=trajectory,
-        gain=np.zeros((samples, 1, 2)),
+    made, std = make_evaluation(1, 3, size, samples, speed=6.0), 0.01 / size * THETA
+    return replace(
+        made,
         sensitivity=np.zeros((samples + 1, 2, 3)),
         information=np.linalg.inv(covariance(std)),
-        eigenvalues=size**2 * np.array([1.0, 2.0, 3.0]),
         std=std,
-        std_over_time=falling(std, t),
-        criterion=size**-2,
-        cost=size**-2,
+        std_over_time=falling(std, made.trajectory.t),
+        cost=made.criterion,
     )
 
 
@@ -124,7 +114,7 @@ def design(name: str = "hinge", samples: int = 50, **changes: object) -> Design:
     history = ten_iterates()
     final = evaluation(1.0, samples)
     share = 0.9 * final.trajectory.qpos[:, 0]
-    fields: dict[str, object] = {
+    fields = {
         "status": Status.CONVERGED,
         "parameters": PARAMETERS,
         "theta": THETA,
@@ -148,7 +138,7 @@ def design(name: str = "hinge", samples: int = 50, **changes: object) -> Design:
         "labels": labels(name),
         "rehearsal": rehearsal(name, steps=finite_steps(predicted=final.std)),
     }
-    return Design(**{**fields, **changes})  # type: ignore[arg-type]
+    return Design(**{**fields, **changes})
 
 
 def estimate(name: str = "hinge", samples: int = 200, **changes: object) -> Estimate:
@@ -169,7 +159,10 @@ def estimate(name: str = "hinge", samples: int = 200, **changes: object) -> Esti
         PredictionErrors(name="new", outputs=(output,), rms=np.array([rms]), mae=np.array([rms]))
         for rms in (0.05, 0.2)
     ]
-    fields: dict[str, object] = {
+    fields = {
+        "parameters": PARAMETERS,
+        "theta": THETA,
+        "std": std,
         "units": UNITS,
         "covariance": covariance(std),
         "chi2": 201.0,
@@ -208,8 +201,7 @@ def estimate(name: str = "hinge", samples: int = 200, **changes: object) -> Esti
             PARAMETERS, UNITS, ("swing.csv", "other.csv", "third.csv")
         ),
     }
-    arguments = {"parameters": PARAMETERS, "theta": THETA, "std": std, **fields, **changes}
-    return bare_estimate(**arguments)  # type: ignore[arg-type]
+    return bare_estimate(**{**fields, **changes})
 
 
 def draws(std: Array) -> ParameterDraws:
@@ -255,38 +247,36 @@ def check(parameters: tuple[str, ...] = PARAMETERS, **changes: object) -> Check:
         for name, unit, value in zip(parameters, UNITS, THETA.tolist(), strict=True)
     )
     std = np.array([row.std for row in rows])
-    fields: dict[str, object] = {
-        "source": "the initial control",
-        "horizon": 2.0,
-        "rows": rows,
-        "wanted": parameters,
-        "information": np.linalg.inv(covariance(std)),
-        "eigenvalues": np.array([1.0, 2.0, 30.0]),
-        "correlation": covariance(np.ones(3)),
-        "confounded": (ConfoundedPair(first=parameters[0], second=parameters[1], correlation=0.8),),
-        "not_separable": (),
-        "not_excited": (),
-        "self_test": SelfTest(recursion=1e-8, slope=1e-6),
-        "findings": ("every identifiable parameter reaches its wanted σ",),
-        "is_start": True,
-    }
-    return Check(**{**fields, **changes})  # type: ignore[arg-type]
+    made = Check(
+        source="the initial control",
+        horizon=2.0,
+        rows=rows,
+        wanted=parameters,
+        information=np.linalg.inv(covariance(std)),
+        eigenvalues=np.array([1.0, 2.0, 30.0]),
+        correlation=covariance(np.ones(3)),
+        confounded=(ConfoundedPair(first=parameters[0], second=parameters[1], correlation=0.8),),
+        not_separable=(),
+        not_excited=(),
+        self_test=SelfTest(recursion=1e-8, slope=1e-6),
+        findings=("every identifiable parameter reaches its wanted σ",),
+        is_start=True,
+    )
+    return replace(made, **changes)
 
 
-def comparison(parameters: tuple[str, ...] = PARAMETERS, **changes: object) -> Comparison:
+def comparison(**changes: object) -> Comparison:
     """A design that is better than one baseline, and one baseline that violates a limit."""
     rows = tuple(
-        MethodResult(
-            method=method,
+        make_method_result(
+            method,
+            cost,
             title=title,
             outcome=outcome,
             control=np.zeros((4, 1)),
-            cost=cost,
-            criterion=cost,
             std=0.01 * cost * THETA,
             min_eigenvalue=1.0 / cost,
             worst_relative_std=0.01 * cost,
-            seconds=1.0,
             steps=1000,
             margins={"position": 0.1},
             relative_margins={"position": 0.1},
@@ -297,20 +287,10 @@ def comparison(parameters: tuple[str, ...] = PARAMETERS, **changes: object) -> C
             (DESIGN, "mjfim's design", 1.0, MethodOutcome.INSIDE),
         )
     )
-    fields: dict[str, object] = {
-        "source": "study.toml",
-        "criterion": "E",
-        "nats": 0.0,
-        "parameters": parameters,
-        "units": UNITS,
-        "scale": THETA,
-        "nuisance": (),
-        "rows": rows,
-        "seconds": 1.0,
-        "seed": 0,
-        "weighted": False,
-    }
-    return Comparison(**{**fields, **changes})  # type: ignore[arg-type]
+    made = make_comparison(
+        *rows, source="study.toml", parameters=PARAMETERS, units=UNITS, scale=THETA
+    )
+    return replace(made, **changes)
 
 
 def trials(std: Array, seed: int) -> TrialStatistics:
@@ -333,15 +313,15 @@ def trials(std: Array, seed: int) -> TrialStatistics:
 def study(parameters: tuple[str, ...] = PARAMETERS, **changes: object) -> MonteCarloStudy:
     """Trials along the initial and the designed trajectory."""
     sets = {"initial": trials(0.1 * THETA, 0), "final": trials(0.01 * THETA, 1)}
-    fields: dict[str, object] = {
-        "parameters": parameters,
-        "theta": THETA,
-        "measure_rate": 100.0,
-        "sets": sets,
-        "information": {name: np.linalg.inv(found.crlb) for name, found in sets.items()},
-        "labels": replace(labels(), parameters=parameters),
-    }
-    return MonteCarloStudy(**{**fields, **changes})  # type: ignore[arg-type]
+    made = MonteCarloStudy(
+        parameters=parameters,
+        theta=THETA,
+        measure_rate=100.0,
+        sets=sets,
+        information={name: np.linalg.inv(found.crlb) for name, found in sets.items()},
+        labels=replace(labels(), parameters=parameters),
+    )
+    return replace(made, **changes)
 
 
 def finite_steps(
@@ -375,38 +355,38 @@ def rehearsal(
         RehearsedLimit(kind=kind, name=name, lower=-1.0, upper=1.0, scale=1.0, unit=unit)
         for kind, unit in (("position", "rad"), ("velocity", "rad/s"))
     )
-    fields: dict[str, object] = {
-        "parameters": parameters,
-        "wrong": 0.2,
-        "feedback": False,
-        "latency": 0.0,
-        "theta": THETA * (1.0 + 0.2 * random.uniform(-1.0, 1.0, (21, 3))),
-        "limits": limits,
-        "margins": np.array([0.4, 0.5]) + 0.1 * random.uniform(-1.0, 1.0, (21, 2)),
-        "joints": ("slide", name),
-        "units": ("m/s", "rad/s"),
-        "speed": rows * np.array([0.5, 0.6]),
-        "acceleration": rows * np.array([5.0, 6.0]),
-        "end_speed": rows * np.array([0.001, 0.002]),
-        "travel": rows * np.array([0.3, 1.2]),
-        "unlimited": ("slide",),
-        "unplaced": ("slide",),
-        "lowest": 0.2 * rows[:, 0],
-        "floor": 0.0,
-        "has_floor": True,
-        "depth": 0.01,
-        "end_height": 0.3 * rows[:, 0],
-        "nearest": 0.1 * rows[:, 0],
-        "in_contact": 0.0 * rows[:, 0],
-        "at_stop": 0.0 * rows[:, 0],
-        "unbraked": {},
-        "steps": finite_steps(parameters),
-        "fans": tuple(map(fan, limits)),
-        "motions": RobotMotions(
+    made = Rehearsal(
+        parameters=parameters,
+        wrong=0.2,
+        feedback=False,
+        latency=0.0,
+        theta=THETA * (1.0 + 0.2 * random.uniform(-1.0, 1.0, (21, 3))),
+        limits=limits,
+        margins=np.array([0.4, 0.5]) + 0.1 * random.uniform(-1.0, 1.0, (21, 2)),
+        joints=("slide", name),
+        units=("m/s", "rad/s"),
+        speed=rows * np.array([0.5, 0.6]),
+        acceleration=rows * np.array([5.0, 6.0]),
+        end_speed=rows * np.array([0.001, 0.002]),
+        travel=rows * np.array([0.3, 1.2]),
+        unlimited=("slide",),
+        unplaced=("slide",),
+        lowest=0.2 * rows[:, 0],
+        floor=0.0,
+        has_floor=True,
+        depth=0.01,
+        end_height=0.3 * rows[:, 0],
+        nearest=0.1 * rows[:, 0],
+        in_contact=0.0 * rows[:, 0],
+        at_stop=0.0 * rows[:, 0],
+        unbraked={},
+        steps=finite_steps(parameters),
+        fans=tuple(map(fan, limits)),
+        motions=RobotMotions(
             robots=(1, 2), t=np.array([0.0, 2.0]), qpos=np.array([[[0.1]], [[0.2]]]) * rows[:2]
         ),
-    }
-    return Rehearsal(**{**fields, **changes})  # type: ignore[arg-type]
+    )
+    return replace(made, **changes)
 
 
 def campaign(parameters: tuple[str, ...] = PARAMETERS, **changes: object) -> Campaign:
@@ -422,35 +402,34 @@ def campaign(parameters: tuple[str, ...] = PARAMETERS, **changes: object) -> Cam
         )
         for number in (1, 2)
     )
-    fields: dict[str, object] = {
-        "parameters": parameters,
-        "wanted": 0.015 * THETA,
-        "rounds": rounds,
-        "status": CampaignStatus.REACHED,
-    }
-    return Campaign(**{**fields, **changes})  # type: ignore[arg-type]
+    made = Campaign(
+        parameters=parameters,
+        wanted=0.015 * THETA,
+        rounds=rounds,
+        status=CampaignStatus.REACHED,
+    )
+    return replace(made, **changes)
 
 
-# Function that makes the result of each verb.
 def robots(**changes: object) -> RobotComparison:
     """Two robots whose damping differs."""
     std = 0.01 * THETA
-    fields: dict[str, object] = {
-        "names": ("monday", "friday"),
-        "recordings": (3, 1),
-        "parameters": PARAMETERS,
-        "units": UNITS,
-        "is_single": np.array([1.0, 0.0, 1.0]),
-        "values": np.array([THETA, THETA + np.array([0.0, 0.001, 0.2])]),
-        "std": np.array([std, 1.5 * std]),
-        "interval": np.array([[-0.07, 0.07], [-0.04, 0.04], [0.18, 0.22]]),
-        "p": np.array([1.0, 0.8, 1e-20]),
-        "detectable": np.array([0.12, 0.06, 0.03]),
-        "joint_p": 1e-18,
-        "level": 0.05,
-        "remarks": ("of friday there is a single recording",),
-    }
-    return RobotComparison(**{**fields, **changes})  # type: ignore[arg-type]
+    made = RobotComparison(
+        names=("monday", "friday"),
+        recordings=(3, 1),
+        parameters=PARAMETERS,
+        units=UNITS,
+        is_single=np.array([1.0, 0.0, 1.0]),
+        values=np.array([THETA, THETA + np.array([0.0, 0.001, 0.2])]),
+        std=np.array([std, 1.5 * std]),
+        interval=np.array([[-0.07, 0.07], [-0.04, 0.04], [0.18, 0.22]]),
+        p=np.array([1.0, 0.8, 1e-20]),
+        detectable=np.array([0.12, 0.06, 0.03]),
+        joint_p=1e-18,
+        level=0.05,
+        remarks=("of friday there is a single recording",),
+    )
+    return replace(made, **changes)
 
 
 def worth(parameters: tuple[str, ...] = PARAMETERS, **changes: object) -> Worth:
@@ -470,49 +449,50 @@ def worth(parameters: tuple[str, ...] = PARAMETERS, **changes: object) -> Worth:
             halved=present / 1.4,
         )
 
-    fields = {
-        "source": "the design",
-        "horizon": 4.0,
-        "parameters": parameters,
-        "units": UNITS,
-        "target": 0.05 * THETA,
-        "is_stated": True,
-        "std": std,
-        "repeated": std / np.sqrt(2.0),
-        "faster": std / np.sqrt(2.0),
-        "sensors": (
+    made = Worth(
+        source="the design",
+        horizon=4.0,
+        parameters=parameters,
+        units=UNITS,
+        target=0.05 * THETA,
+        is_stated=True,
+        std=std,
+        repeated=std / np.sqrt(2.0),
+        faster=std / np.sqrt(2.0),
+        sensors=(
             sensor(f"angle of {parameters[0]}", 1.0),
             sensor("rate", 3.0),
             sensor("gyro of bob", 2.0, is_added=True),
         ),
-        "fewest": ("rate", "gyro of bob"),
-        "prices": (
+        fewest=("rate", "gyro of bob"),
+        prices=(
             Price(name="control of motor", step="10 % wider", predicted=-0.07, redesigned=-0.068),
             Price(name="time", step="0.4 s more"),
         ),
-    }
-    return Worth(**{**fields, **changes})  # type: ignore[arg-type]
+    )
+    return replace(made, **changes)
 
 
-def watch(parameters: tuple[str, ...] = PARAMETERS, **changes: object) -> Watch:
+def watch(**changes: object) -> Watch:
     """A stream of 12 s, after which one of three parameters is known well enough."""
     t = np.linspace(0.0, 12.0, 60)
     std = np.outer(1.0 / np.sqrt(np.maximum(t, 0.1)), THETA * np.array([0.1, 0.2, 0.4]))
-    fields = {
-        "parameters": parameters,
-        "units": UNITS,
-        "sizes": np.abs(THETA),
-        "wanted": 0.05 * np.abs(THETA),
-        "is_stated": True,
-        "t": t,
-        "std_over_time": std,
-        "reached": np.array([4.0, np.inf, np.inf]),
-        "rows": 1200,
-        "left_out": 2,
-    }
-    return Watch(**{**fields, **changes})  # type: ignore[arg-type]
+    made = Watch(
+        parameters=PARAMETERS,
+        units=UNITS,
+        sizes=np.abs(THETA),
+        wanted=0.05 * np.abs(THETA),
+        is_stated=True,
+        t=t,
+        std_over_time=std,
+        reached=np.array([4.0, np.inf, np.inf]),
+        rows=1200,
+        left_out=2,
+    )
+    return replace(made, **changes)
 
 
+# Function that makes the result of each verb.
 MAKERS = {
     "compare-robots": robots,
     "design": design,

@@ -38,13 +38,13 @@ def chirp(amplitude: float, low: float, high: float, **more: Any) -> dict[str, A
     }
 
 
-def state_noise(joints: tuple[str, ...], q: float = 0.002, v: float = 0.02) -> dict[str, float]:
+def state_noise(*joints: str) -> dict[str, float]:
     """Return the noise of encoders [rad or m] and of their rates."""
-    return {f"qpos:{j}": q for j in joints} | {f"qvel:{j}": v for j in joints}
+    return {f"qpos:{j}": 0.002 for j in joints} | {f"qvel:{j}": 0.02 for j in joints}
 
 
 # The experiments by their names.
-EXPERIMENTS: dict[str, dict[str, Any]] = {
+EXPERIMENTS = {
     # The pendulum swings about hanging, because its motor is weak against gravity.
     "pendulum": {
         "model": "dmc_pendulum/pendulum.xml",
@@ -52,11 +52,11 @@ EXPERIMENTS: dict[str, dict[str, Any]] = {
         "horizon": 5.0,
         "initial": {"qpos": (PI,), "control": chirp(0.3, 0.2, 1.5)},
         "parameters": {
-            "mass": {"target": "body/pole:mass"},
-            "com": {"target": "body/pole:ipos[2]"},
-            "damping": {"target": "joint/hinge:damping"},
+            "mass": "body/pole:mass",
+            "com": "body/pole:ipos[2]",
+            "damping": "joint/hinge:damping",
         },
-        "noise": state_noise(("hinge",)),
+        "noise": state_noise("hinge"),
         "cost": {"criterion": "E", "control": 2e-4},
         "descent": {"tolerance": 1e-3},
     },
@@ -66,14 +66,14 @@ EXPERIMENTS: dict[str, dict[str, Any]] = {
         "horizon": 4.0,
         "initial": {"qpos": (0.0, PI), "control": chirp(0.25, 0.8, 2.5)},
         "parameters": {
-            "cart_mass": {"target": "body/cart:mass"},
-            "pole_mass": {"target": "body/pole_1:mass"},
-            "pole_com": {"target": "body/pole_1:ipos[2]"},
+            "cart_mass": "body/cart:mass",
+            "pole_mass": "body/pole_1:mass",
+            "pole_com": "body/pole_1:ipos[2]",
             # The dampings of the model, 5e-4 and 2e-6, have no visible effect in four seconds.
             "cart_damping": {"target": "joint/slider:damping", "guess": 0.5},
             "pole_damping": {"target": "joint/hinge_1:damping", "guess": 2e-3},
         },
-        "noise": state_noise(("slider", "hinge_1")),
+        "noise": state_noise("slider", "hinge_1"),
         "cost": {
             "criterion": "E",
             "control": 4e-3,
@@ -88,14 +88,14 @@ EXPERIMENTS: dict[str, dict[str, Any]] = {
         "horizon": 4.0,
         "initial": {"qpos": (PI, 0.0), "control": chirp(0.5, 0.2, 2.0)},
         "parameters": {
-            "upper_mass": {"target": "body/upper_arm:mass"},
-            "lower_mass": {"target": "body/lower_arm:mass"},
-            "upper_com": {"target": "body/upper_arm:ipos[2]"},
-            "lower_com": {"target": "body/lower_arm:ipos[2]"},
-            "shoulder_damping": {"target": "joint/shoulder:damping"},
-            "elbow_damping": {"target": "joint/elbow:damping"},
+            "upper_mass": "body/upper_arm:mass",
+            "lower_mass": "body/lower_arm:mass",
+            "upper_com": "body/upper_arm:ipos[2]",
+            "lower_com": "body/lower_arm:ipos[2]",
+            "shoulder_damping": "joint/shoulder:damping",
+            "elbow_damping": "joint/elbow:damping",
         },
-        "noise": state_noise(("shoulder", "elbow")),
+        "noise": state_noise("shoulder", "elbow"),
         "cost": {"criterion": "E", "control": 0.2},
         "descent": {"tolerance": 1e-3, "max_iterations": 15},
     },
@@ -106,12 +106,12 @@ EXPERIMENTS: dict[str, dict[str, Any]] = {
         "horizon": 3.0,
         "initial": {"control": chirp(0.004, 1.0, 4.0, offset=-0.0005)},
         "parameters": {
-            "arm_damping": {"target": "joint/theta:damping"},
-            "pole_damping": {"target": "joint/alpha:damping"},
+            "arm_damping": "joint/theta:damping",
+            "pole_damping": "joint/alpha:damping",
             "arm_armature": {"target": "joint/theta:armature", "guess": 5e-6},
-            "motor_gain": {"target": "actuator/motor:gainprm[0]"},
+            "motor_gain": "actuator/motor:gainprm[0]",
         },
-        "noise": state_noise(("theta", "alpha")),
+        "noise": state_noise("theta", "alpha"),
         "cost": {"criterion": "E", "control": 200.0, "tracking": {"theta": 6e-3}},
         "descent": {"tolerance": 1e-2, "max_iterations": 15},
         "limits": {"control": {"motor": (-0.02, 0.02)}, "position": {"theta": (-2.0, 2.0)}},
@@ -138,16 +138,16 @@ EXPERIMENTS: dict[str, dict[str, Any]] = {
             ),
         },
         "parameters": {
-            "upper_mass": {"target": "body/Upper_Arm:mass"},
-            "lower_mass": {"target": "body/Lower_Arm:mass"},
-            "lower_com": {"target": "body/Lower_Arm:ipos[2]"},
-            "jaw_mass": {"target": "body/Fixed_Jaw:mass"},
-            "pitch_armature": {"target": "joint/Pitch:armature"},
-            "elbow_armature": {"target": "joint/Elbow:armature"},
-            "pitch_friction": {"target": "joint/Pitch:frictionloss"},
-            "elbow_friction": {"target": "joint/Elbow:frictionloss"},
+            "upper_mass": "body/Upper_Arm:mass",
+            "lower_mass": "body/Lower_Arm:mass",
+            "lower_com": "body/Lower_Arm:ipos[2]",
+            "jaw_mass": "body/Fixed_Jaw:mass",
+            "pitch_armature": "joint/Pitch:armature",
+            "elbow_armature": "joint/Elbow:armature",
+            "pitch_friction": "joint/Pitch:frictionloss",
+            "elbow_friction": "joint/Elbow:frictionloss",
         },
-        "noise": state_noise(SO_ARM),
+        "noise": state_noise(*SO_ARM),
         "cost": {
             "criterion": "E",
             "control": 2.0,
@@ -174,12 +174,12 @@ EXPERIMENTS: dict[str, dict[str, Any]] = {
             "control": chirp(0.05, 0.8, 2.0, offset=ARM26),
         },
         "parameters": {
-            "shoulder_damping": {"target": "joint/shoulder:damping"},
-            "elbow_damping": {"target": "joint/elbow:damping"},
+            "shoulder_damping": "joint/shoulder:damping",
+            "elbow_damping": "joint/elbow:damping",
             "shoulder_armature": {"target": "joint/shoulder:armature", "guess": 0.05},
             "elbow_armature": {"target": "joint/elbow:armature", "guess": 0.02},
         },
-        "noise": state_noise(("shoulder", "elbow")),
+        "noise": state_noise("shoulder", "elbow"),
         "cost": {"criterion": "E", "control": 3.0, "control_about": ARM26},
         "descent": {"tolerance": 1e-2, "max_iterations": 60},
     },
@@ -190,12 +190,12 @@ EXPERIMENTS: dict[str, dict[str, Any]] = {
         "horizon": 3.0,
         "initial": {"keyframe": "home", "control": chirp(0.02, 0.2, 0.8)},
         "parameters": {
-            "link4_mass": {"target": "body/link4:mass"},
-            "link4_com": {"target": "body/link4:ipos[1]"},
-            "link7_mass": {"target": "body/link7:mass"},
-            "link7_com": {"target": "body/link7:ipos[2]"},
+            "link4_mass": "body/link4:mass",
+            "link4_com": "body/link4:ipos[1]",
+            "link7_mass": "body/link7:mass",
+            "link7_com": "body/link7:ipos[2]",
         },
-        "noise": state_noise(PANDA),
+        "noise": state_noise(*PANDA),
         "cost": {
             "criterion": "E",
             # The weights keep the stiff servos (kp 2000 and 500) inside their forcerange when the

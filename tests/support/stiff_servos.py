@@ -51,14 +51,14 @@ def stiff_arm_experiment(folder: Path, amplitude: float = 0.3, **tables: Any) ->
         "frequency": 1.0,
         "offset": {"shoulder": START[0], "elbow": START[1]},
     }
-    stated: dict[str, Any] = {
+    stated = {
         "model": "stiff_arm.xml",
         "rate": 50.0,
         "horizon": 1.0,
         "initial": {"qpos": START, "control": swing},
         "parameters": {
-            "mass": {"target": "body/fore:mass"},
-            "damping": {"target": "joint/shoulder:damping"},
+            "mass": "body/fore:mass",
+            "damping": "joint/shoulder:damping",
         },
         "noise": {"state": 0.01},
         "cost": {"control": 0.0},
@@ -75,9 +75,9 @@ def dry_arm_experiment(folder: Path, **tables: Any) -> Experiment:
         **tables: Tables of the experiment that replace those of `stiff_arm_experiment`.
     """
     parameters = {
-        "mass": {"target": "body/fore:mass"},
-        "damping": {"target": "joint/shoulder:damping"},
-        "friction": {"target": "joint/shoulder:frictionloss"},
+        "mass": "body/fore:mass",
+        "damping": "joint/shoulder:damping",
+        "friction": "joint/shoulder:frictionloss",
     }
     experiment = stiff_arm_experiment(folder, 0.0005, **{"parameters": parameters, **tables})
     dry = STIFF_ARM.replace('damping="0.6"', 'damping="0.6" frictionloss="0.05"')

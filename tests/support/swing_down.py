@@ -56,7 +56,7 @@ def swing_down(
     )
     (folder / "swing_down.xml").write_text(text, encoding="utf-8")
 
-    values: dict[str, Any] = {
+    values = {
         "model": "swing_down.xml",
         "rate": 50.0,
         "horizon": 3.0,
@@ -85,7 +85,7 @@ def small_swing(t: Array, angle: float, damping: float, centre: float) -> Array:
     stiffness = -MASS * GRAVITY * centre / inertia
     omega = np.sqrt(stiffness - decay**2)
     phase = omega * t
-    return np.asarray(angle * np.exp(-decay * t) * (np.cos(phase) + decay / omega * np.sin(phase)))
+    return angle * np.exp(-decay * t) * (np.cos(phase) + decay / omega * np.sin(phase))
 
 
 def small_swing_information(t: Array, angle: float) -> Array:
@@ -99,4 +99,4 @@ def small_swing_information(t: Array, angle: float) -> Array:
         behind = small_swing(t, angle, DAMPING - step[0], -CENTRE - step[1])
         columns.append((ahead - behind) / 2e-6)
     G = np.stack(columns, axis=1) / SIGMA
-    return np.asarray(G.T @ G)
+    return G.T @ G

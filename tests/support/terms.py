@@ -48,7 +48,7 @@ DAMPING = 0.01
 WEIGHT = 0.2 * 9.81 * 0.1
 
 # Kind of a term -> its table, and true values of its fields that the motion shows.
-EXAMPLES: dict[str, tuple[dict[str, Any], dict[str, float]]] = {
+EXAMPLES = {
     "stribeck": ({"joint": "pivot"}, {"excess": 0.04, "speed": 0.5}),
     "lugre": ({"joint": "pivot"}, {"coulomb": 0.03, "excess": 0.03, "speed": 0.5}),
     "asymmetric_friction": ({"joint": "pivot"}, {"offset": 0.02}),
