@@ -29,15 +29,6 @@ def an_iterate(**changes: float) -> DesignEvent:
     return DesignEvent(start="initial", row=HistoryRow(iteration=7, steps=100, **numbers))  # type: ignore[arg-type]
 
 
-def a_terminal(monkeypatch: pytest.MonkeyPatch, width: int) -> io.StringIO:
-    """What is written on a terminal of some width."""
-    stream = io.StringIO()
-    monkeypatch.setattr(
-        module, "errors", Console(file=stream, force_terminal=True, width=width, highlight=False)
-    )
-    return stream
-
-
 @pytest.mark.parametrize(
     ("seconds", "shown"), [(0.2, "0:00"), (59.6, "1:00"), (135.0, "2:15"), (3725.0, "1:02:05")]
 )
@@ -64,23 +55,22 @@ def test_parts_are_counted_where_their_number_is_known() -> None:
     assert task.total is None
 
 
-def test_no_time_is_cut_on_a_narrow_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Long descriptions are folded between words."""
-    stream = a_terminal(monkeypatch, 60)
+def test_texts_are_broken_between_words_and_times_and_paths_stay_whole(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """On a narrow terminal."""
+    stream = io.StringIO()
+    console = Console(file=stream, force_terminal=True, width=60, highlight=False)
+    monkeypatch.setattr(module, "errors", console)
+    path = "/folder/" + "long_name" * 12 + ".toml"
+    say(f"mjfim: {path}: this sentence is longer than a line, because it has so many words")
+    lines = stream.getvalue().splitlines()
+    assert any(path in line for line in lines)
+    assert all(len(line) <= 60 for line in lines if path not in line)
+
     with progress("designing", at_most=4000.0) as display:
         display.show("a description that is so long that it does not fit in one line")
     assert "1:06:40" in stream.getvalue() and "…" not in stream.getvalue()
-
-
-def test_messages_are_broken_between_words_and_paths_stay_whole(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    path = "/folder/" + "long_name" * 12 + ".toml"
-    stream = a_terminal(monkeypatch, 40)
-    say(f"mjfim: {path}: this sentence is longer than a line")
-    lines = stream.getvalue().splitlines()
-    assert any(path in line for line in lines)
-    assert all(len(line) <= 40 for line in lines if path not in line)
 
 
 def test_without_a_terminal_a_line_comes_every_ten_seconds(
