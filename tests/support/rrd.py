@@ -19,36 +19,37 @@ class Recorded:
         entities: Every entity path.
     """
 
-    def __init__(self, path: Path) -> None:
-        self._reader = RrdReader(path)
+    def __init__(self, path: Path, timeline: str = "sim_time") -> None:
+        self._reader, self._timeline = RrdReader(path), timeline
         self._chunks = [
             (str(chunk.entity_path), chunk.is_static, chunk.to_record_batch())
             for chunk in self._reader.stream().to_chunks()
         ]
         self.entities = {entity for entity, _, _ in self._chunks}
+        assert not any("warning" in entity for entity in self.entities)
 
     def rows(
-        self, at: tuple[str, ...] | str, component: str, timeline: str | None = "sim_time"
-    ) -> tuple[Array, Array]:
-        """Times and values of a component, sorted by time; without a timeline, static data."""
-        found: list[tuple[int, Any]] = []
+        self, at: tuple[str, ...] | str, component: str, timeline: str = ""
+    ) -> tuple[Array, list[Any]]:
+        """Times and values of a component of an entity, sorted by time."""
+        name, found = timeline or self._timeline, []
         entity = at if isinstance(at, str) else entity_path(at)
-        for place, is_static, batch in self._chunks:
-            names = batch.schema.names
-            if place != entity or component not in names:
-                continue
-            values = batch.column(component).to_pylist()
-            if timeline in names:
-                times = batch.column(timeline).cast("int64").to_pylist()
-                found += zip(times, values, strict=True)
-            elif timeline is None and is_static:
-                found += [(0, value) for value in values]
+        for place, _, batch in self._chunks:
+            if place == entity and {component, name} <= {*batch.schema.names}:
+                times = batch.column(name).cast("int64").to_pylist()
+                found += zip(times, batch.column(component).to_pylist(), strict=True)
         found.sort(key=lambda row: row[0])
-        times = np.array([time for time, _ in found])
-        try:
-            return times, np.array([value for _, value in found])
-        except ValueError:  # rows of several lengths
-            return times, np.array([value for _, value in found], dtype=object)
+        return np.array([time for time, _ in found]), [value for _, value in found]
+
+    def static(self, at: tuple[str, ...] | str, component: str) -> list[Any]:
+        """Values of a component that belong to no time."""
+        entity = at if isinstance(at, str) else entity_path(at)
+        return [
+            value
+            for place, is_static, batch in self._chunks
+            if is_static and place == entity and component in batch.schema.names
+            for value in batch.column(component).to_pylist()
+        ]
 
     def scalars(self, at: tuple[str, ...] | str) -> tuple[Array, Array]:
         """Times [s] and values of a curve."""
