@@ -334,16 +334,3 @@ def test_recording_round_trip(recording: Recording, task: DesignTask, tmp_path: 
     assert (again.outputs, again.name) == (recording.outputs, str(path))
     assert np.isnan(recording.y[1::2]).all()
     assert np.isfinite(recording.y[::2]).all()
-
-
-# ---- estimates and studies
-
-
-def test_estimate_summary() -> None:
-    """estimate.json has the documented keys and is standard JSON."""
-    estimate = results.estimate()
-    data = strict_json(as_json(estimate.summary()))
-    for key in ("theta", "std", "covariance", "chi2", "dof", "residual_rms", "misfit"):
-        assert np.array_equal(data[key], getattr(estimate, key)), key
-    assert (data["parameters"], data["units"]) == ([*results.PARAMETERS], [*results.UNITS])
-    assert data["prior"] == np.zeros((P, P)).tolist()

@@ -31,7 +31,6 @@ from mjfim.output.rerun.camera import (
 from mjfim.output.rerun.scene import INFINITE_REACH, OUTLINE, SOLID, body_poses, entity_path
 from mjfim.records.design import Design
 from mjfim.records.estimate import Estimate, Prediction, PredictionErrors
-from mjfim.records.estimate_parts import InformationInTime, ResidualForce
 from mjfim.records.rehearsal import RobotMotions
 from tests.support import results
 from tests.support.made_motions import designed, estimated, load, simulated
@@ -455,19 +454,11 @@ def test_ribbons_are_curves_over_time_and_residual_torques_are_planes(
     cart: mujoco.MjModel, tmp_path: Path
 ) -> None:
     made = estimated(cart, simulated(cart, 1.0))
-    speed, end = np.sin(np.arange(100.0)), float(made.recordings[0].t[-1])
-    in_time = InformationInTime(
-        parameters=made.parameters,
-        recording=np.zeros(2),
-        times=0.5 * end * np.array([[0.0, 1.0], [1.0, 2.0]]),
-        shares=np.tile([[0.25], [0.75]], 2),
-        pulls=np.zeros((2, 2)),
-        scatter=1.0,
+    end = float(made.recordings[0].t[-1])
+    in_time = results.information_in_time(made.parameters, end)
+    shown, _ = logged_estimate(
+        tmp_path, cart, in_time=in_time, residual_forces=results.residual_forces("slide")
     )
-    residual = ResidualForce(
-        joint="slide", unit="N", position=speed, speed=speed, force=speed, sigma=0.1, size=1.0
-    )
-    shown, _ = logged_estimate(tmp_path, cart, in_time=in_time, residual_forces=(residual,))
     information, outputs, residuals = opened_rows(shown)
     assert information == [entity_path(("information [% per s]", "run 0"))]
     assert [f"{name}:" in other for name, other in zip(outputs, residuals, strict=True)]
@@ -475,9 +466,9 @@ def test_ribbons_are_curves_over_time_and_residual_torques_are_planes(
     first = entity_path(("information [% per s]", "run 0")) + "/0"
     (curve,) = (name for name in shown.entities if name.startswith(first))
     times, values = shown.scalars(curve)
-    assert_allclose(values, np.array([25.0, 75.0]) * 2.0 / end)
-    assert_allclose(times, [0.0, 0.5 * end], atol=1e-6)
-    plane = entity_path(("residual torque", "slide [N] over speed [m/s]"))
+    assert_allclose(values, 90.0 / end)
+    assert_allclose(times, in_time.times[:, 0], atol=1e-6)
+    plane = entity_path(("residual torque", "slide [N m] over speed [rad/s]"))
     assert any(name.startswith(plane) for name in shown.entities)
 
 
