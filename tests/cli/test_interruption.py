@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
 import signal
 import subprocess
 import sys
@@ -14,26 +13,18 @@ import pytest
 
 import mjfim
 from mjfim.cli.progress import ProgressDisplay
-from mjfim.excitation.evaluation import evaluate_task
-from mjfim.excitation.task import DesignTask
 from mjfim.experiment.system import System
 from mjfim.identification.assessment import parameter_draws
-from mjfim.output import archive
-from mjfim.output.folders import DESIGN_ARCHIVE
 from mjfim.output.manifest import MANIFEST
 from mjfim.output.plots import draw
 from mjfim.parallel.budget import NOTHING_SENTENCE
 from mjfim.studies import check as study_check
-from tests.fuzz.result_files import faults_of
 from tests.support.cli import (
-    DESIGN,
     ESTIMATE_DATA,
-    PROCESS,
     done,
     names,
     read,
     run,
-    write_experiment,
 )
 from tests.support.paths import MODELS, ROOT
 
@@ -158,38 +149,3 @@ def test_a_press_while_the_program_or_a_verb_starts(module: str) -> None:
     assert ended.returncode == 1
     assert ended.stderr == f"mjfim: {NOTHING_SENTENCE}\n"
     assert not ended.stdout
-
-
-@pytest.mark.slow
-def test_interrupted_design_leaves_the_best_so_far(tmp_path: Path) -> None:
-    """Exit code 1, all files can be read, and the result is better than the start."""
-    path = write_experiment(tmp_path, tolerance="1e-12", max_iterations="200\nstarts = 10000")
-    words = [*PROCESS, "design", path, "-o", tmp_path / "out", "--threads", "1"]
-    with subprocess.Popen(
-        words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    ) as process:
-        assert process.stderr is not None
-        told = iter(process.stderr.readline, "")
-        try:
-            assert any(re.search(r"iteration +[1-9]\d", line) for line in told)
-            process.send_signal(signal.SIGINT)
-            _, rest = process.communicate(timeout=60)
-        finally:
-            process.kill()
-    assert process.returncode == 1
-    assert "Traceback" not in rest
-    assert "wrote" in rest
-    out = tmp_path / "out"
-
-    # On a busy computer there is no time for all pictures, which the last sentence says then.
-    # It is not rehearsed.
-    missing = (DESIGN | {MANIFEST}) - names(out) - {"rehearsal.png", "valley.png", "worth.png"}
-    assert missing <= DESIGN - set(DESIGN_ARCHIVE)
-    assert bool(missing) == (f"`mjfim report {out} --pictures`" in rest)
-    data = read(out / "design.json")
-    assert data["status"] == "interrupted"
-    assert data["final"]["eigenvalues"][0] > 5 * data["initial"]["eigenvalues"][0]
-    task = DesignTask.resolve(mjfim.Experiment.from_file(path))
-    cost = evaluate_task(task, archive.read_design(out / "design.npz")["final"]).cost
-    assert cost == pytest.approx(data["final"]["cost"], rel=1e-6)
-    assert [fault for file in out.iterdir() for fault in faults_of(file)] == []

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import re
-import subprocess
-import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -16,7 +14,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from mjfim.errors import MjfimError
-from mjfim.output import plots, words
+from mjfim.output import words
 from mjfim.output.archive import rotation_vectors
 from mjfim.output.panels import Mark, Panel, Picture, range_of_intervals
 from mjfim.output.plots.design import (
@@ -46,7 +44,6 @@ from tests.support.made_records import (
     make_row,
     make_study,
 )
-from tests.support.paths import ROOT
 
 LABELS = make_labels(2, 3)
 
@@ -503,19 +500,3 @@ def test_settings_of_the_user_change_no_figure_and_stay(tmp_path: Path) -> None:
         save(figure_of(picture), tmp_path / "other.png")
         assert mpl.rcParams["font.size"] == 20.0
     assert (tmp_path / "plain.png").read_bytes() == (tmp_path / "other.png").read_bytes()
-
-
-@pytest.mark.slow
-def test_pictures_need_no_matplotlib_and_figures_no_pyplot() -> None:
-    code = (
-        "import sys\n"
-        "import mjfim.output.plots.pictures\n"
-        "assert 'matplotlib' not in sys.modules\n"
-        "import mjfim.output.plots.draw\n"
-        "assert 'matplotlib.pyplot' not in sys.modules\n"
-    )
-    subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=True)
-    package = Path(plots.__file__).parents[1]
-    pattern = re.compile(r"^(import|from) matplotlib", re.MULTILINE)
-    importers = [p.name for p in package.rglob("*.py") if pattern.search(p.read_text())]
-    assert importers == ["draw.py"]

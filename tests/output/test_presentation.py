@@ -122,8 +122,3 @@ def test_pictures_of_an_earlier_run_in_another_format_are_removed(tmp_path: Path
             write_pictures(tmp_path, pictures, chosen)
     found = {file.name for file in tmp_path.glob("limits*")}
     assert found == {"limits.svg", "limits.pdf"}
-
-
-def test_names_of_pictures_follow_their_format() -> None:
-    names = PictureFormat.PDF.files(("check.json", "check.png"))
-    assert names == ("check.json", "check.pdf")

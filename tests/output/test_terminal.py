@@ -37,15 +37,13 @@ def test_nothing_is_cut(verb: str, width: int, verbose: bool) -> None:
     assert letters(text).startswith(letters(page.verdict.sentence)[1:], 1)
     assert not page.next_steps or letters(f"Next: {page.next_steps[0]}") in letters(text)
     assert "…" not in text
-    if verbose:
-        for table in page.tables:
-            cells = [
-                cell
-                for row in table.rows
-                for k, cell in enumerate(row.cells)
-                if not table.is_left(k)
-            ]
-            assert [cell for cell in cells if letters(cell) not in letters(text)] == []
+    for table in page.tables if verbose else ():
+        assert {len(row.cells) for row in table.rows} <= {len(table.columns)}
+        assert set(table.spare) - {"at bound"} <= set(table.columns)
+        cells = [
+            cell for row in table.rows for k, cell in enumerate(row.cells) if not table.is_left(k)
+        ]
+        assert [cell for cell in cells if letters(cell) not in letters(text)] == []
 
 
 @verbs
