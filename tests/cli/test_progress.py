@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -12,7 +11,6 @@ from rich.console import Console
 from rich.progress import Progress
 
 from mjfim.cli import progress as module
-from mjfim.cli.common import say_written
 from mjfim.cli.progress import ProgressDisplay, clock, progress, say
 from mjfim.excitation.task import DesignTask
 from mjfim.output.progress_text import design_stage, design_text
@@ -84,14 +82,6 @@ def test_without_a_terminal_a_line_comes_every_ten_seconds(
     lines = capsys.readouterr().err.splitlines()
     assert [line.partition(" J ")[2].split()[0] for line in lines] == ["10", "20", "30"]
     assert lines[0].startswith("searching inside the limits at 50 Hz, barrier")
-
-
-def test_the_report_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    say_written(tmp_path)
-    (tmp_path / "report.html").touch()
-    say_written(tmp_path)
-    first, second = capsys.readouterr().err.replace("\n", " ").split("wrote ")[1:]
-    assert "report.html" not in first and f"see {tmp_path / 'report.html'}" in second
 
 
 def test_a_check_names_its_stages() -> None:

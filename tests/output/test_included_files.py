@@ -11,6 +11,7 @@ import pytest
 
 from mjfim.errors import ModelError
 from mjfim.output.export.mjcf import identified_files, write_identified
+from mjfim.output.folders import sample_files
 from tests.output.test_mjcf import assert_is_identified_model, changes, compiled, system_of
 from tests.support.contents import contents
 
@@ -146,6 +147,9 @@ def test_the_text_stays_as_it_is_and_a_copy_can_be_identified_again(
     assert "<!-- measured in May -->" in copy.read_text("utf-8")
     _, gained = changes(parts / "hand" / "hand.xml", first.with_name("identified_hand.xml"))
     assert gained == ['<joint name="finger" axis="1 0 0" damping="0.05" range="-90 90"/>']
+
+    # Each drawn robot has copies of its own.
+    assert "samples/robot_0002_hand.xml" in sample_files(tmp_path, 2, robot)
 
     # In the folder of its own model, the copy takes another name.
     again = system_of(first, tmp_path, "joint/finger:damping")

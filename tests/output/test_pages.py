@@ -287,7 +287,7 @@ END_IN_MOTION = {"unbraked": {"slide": 20}, "end_speed": np.ones((21, 2))}
 # By result: changes, words of the first next step, and whether it says to design again.
 NEXT_STEPS: list[tuple[str, dict[str, Any], str, bool]] = [
     ("design", {}, "mjfim export", False),
-    ("design", {"limits": {"position": -0.1}}, "Widen the limit", True),
+    ("design", {"limits": {"position": -0.1}}, "Widen the limit", False),
     ("identify", {}, "Use `identified.xml`", False),
     ("campaign", {"status": CampaignStatus.WAITING}, "--recordings FILE", False),
     # Cures by cause: no floor, differences that grow, an end in motion, too little room.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -114,11 +113,3 @@ def test_cells_are_folded_and_aligned_by_their_width_on_the_screen() -> None:
         "left arm",
         "x                -10",
     ]
-
-
-@pytest.mark.slow
-def test_tables_of_large_models_are_printed_in_seconds() -> None:
-    """A model with 10 000 tendons has 60 000 parameters."""
-    begin = time.process_time()
-    assert "p59999" in printed(page_with(rows_table(60_000)), 80, verbose=True)
-    assert time.process_time() - begin < 10.0
