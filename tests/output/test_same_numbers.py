@@ -83,9 +83,10 @@ def test_what_would_help_is_the_same_in_json_table_and_picture() -> None:
     (table,) = (each for each in page_of(worth).tables if each.title == "Sensors")
     column = table.columns.index("σ without it")
     words = {row.cells[0]: row.cells[column] for row in table.rows}
-    for name, ratio in without.items():
-        change = ratio / np.max(std / target)
-        assert words[name].startswith("same" if change < 1.05 else f"× {change:.1f}")
+    assert set(words) == {each["name"] for each in stated["sensors"] if not each["is_added"]}
+    for name, word in words.items():
+        change = without[name] / np.max(std / target)
+        assert word.startswith("same" if change < 1.05 else f"× {change:.1f}")
 
     panel = pictures_of(worth)["worth"]().panels[0]
     drawn = next(mark for mark in panel.marks if mark.label == "without it")
