@@ -15,7 +15,7 @@ import pytest
 from mjfim.output.page import Page, as_sentence
 from mjfim.output.pages import page_of
 from mjfim.output.plots.pictures import pictures_of
-from mjfim.output.report import as_html
+from mjfim.output.report import as_html, report_of
 from mjfim.records.campaign import CampaignStatus
 from mjfim.records.check import findings_of_check
 from mjfim.records.design import Status
@@ -415,6 +415,7 @@ def test_the_cause_stands_under_the_verdict_with_the_command_that_cures_it(tmp_p
     assert short.count("Warning:") == 2 and "Not shown here" in short
     assert complete.count("Warning:") == 10
     assert complete.count("Fix first:") == 2 and "Detail: largest residuals in q" in complete
+    assert "<li>Largest residuals in q" in report_of([cause()])
 
     # What a misfit asks for comes before more data, even where parameters are poorly known.
     first, *others = page_of(cause(sloppy=("length",))).next_steps
