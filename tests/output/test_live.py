@@ -178,6 +178,7 @@ def test_the_end_of_a_burst_is_transmitted_without_a_further_event(
     def wake(show: LiveShow) -> None:
         """The time of the timer is over."""
         timer.assert_called_once()
+        timer.return_value.start.assert_called_once()
         seconds, update = timer.call_args.args
         assert seconds == UPDATE_SECONDS and timer.return_value.daemon is True
         update()

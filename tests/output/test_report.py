@@ -298,5 +298,8 @@ def test_a_report_has_the_name_of_its_experiment_wherever_it_is(tmp_path: Path) 
 
 
 def test_a_report_draws_every_length_of_segments_that_was_compared() -> None:
-    study = results.horizons()
-    assert "whole recordings" in report_of([results.estimate(horizons=study)])
+    grown = results.horizons()
+    for study, is_flat in ((grown, False), (replace(grown, errors=np.ones((4, 4))), True)):
+        html = report_of([results.estimate(horizons=study)])
+        assert "whole recordings" in html
+        assert ("an effect that does not add up" in html.replace("\n", " ")) is is_flat
