@@ -5,6 +5,7 @@ Every process of the tests computes them once. Tests only read them.
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import pytest
@@ -54,6 +55,27 @@ def identified(home: Path, study: Path, recorded: Path) -> Result:
     with pytest.MonkeyPatch.context() as monkeypatch:
         write_empty_figures(monkeypatch)
         return run("identify", study, recorded, "-o", home / "fit", "--json")
+
+
+@pytest.fixture
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The current folder, which is empty."""
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.fixture
+def folder(home: Path, recorded: Path, here: Path) -> Path:
+    """The current folder: the short study, its design and recording, and files of the user."""
+    for name in ("study.toml", "cart_pendulum.xml", "cart_pendulum.csv", "run.csv"):
+        shutil.copy(home / name, here)
+    (here / "out").mkdir()
+    for name in ("design.npz", "design.json"):
+        shutil.copy(home / "out" / name, here / "out")
+    for name in ("notes.txt", "film.gif"):
+        (here / name).write_text("mine", encoding="utf-8")
+    (here / "empty").mkdir()
+    return here
 
 
 @pytest.fixture

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import tomllib
 from pathlib import Path
 
@@ -16,87 +15,51 @@ from mjfim.recordings.read import read_recording
 from tests.support.cart_pendulum import cart_pendulum, logs_of
 from tests.support.cli import MODELS, done, loads, misused, names, run
 
-
-def test_init_does_not_overwrite_files_of_the_user(tmp_path: Path) -> None:
-    file = tmp_path / "mine.toml"
-    file.write_text("mine", encoding="utf-8")
-    misused(run("init", MODELS / "cart_pendulum.xml", "-o", file), "mine.toml")
-    assert file.read_text(encoding="utf-8") == "mine"
-
-    # The model itself is never replaced, not even by force.
-    model = tmp_path / "model.xml"
-    model.write_bytes((MODELS / "cart_pendulum.xml").read_bytes())
-    done("init", model, "-o", model, "--force", code=2)
-    assert model.read_bytes() == (MODELS / "cart_pendulum.xml").read_bytes()
+MODEL = MODELS / "cart_pendulum.xml"
 
 
-def test_init_writes_nothing_for_a_wrong_group(tmp_path: Path) -> None:
-    words = ("-o", tmp_path / "a.toml", "--parameters", "frictions")
-    result = run("init", MODELS / "cart_pendulum.xml", *words)
-    misused(result, "unknown group 'frictions'", "'friction'")
-    assert names(tmp_path) == set()
-
-
-def test_a_model_and_an_experiment_in_the_place_of_the_other(tmp_path: Path) -> None:
-    model, experiment = MODELS / "cart_pendulum.xml", MODELS / "cart_pendulum.toml"
-    for verb in ("validate", "check", "design"):
-        result = run(verb, model, *(["-o", tmp_path / "out"] if verb == "design" else []))
-        misused(result, f"`mjfim init {model}` writes a first one")
-
-    for verb in ("init", "list"):
-        misused(run(verb, experiment), f"{experiment}: an experiment file, but a model")
-
-
-def test_a_model_without_joints_is_refused(tmp_path: Path) -> None:
-    model = tmp_path / "rigid.xml"
-    model.write_text("<mujoco/>", encoding="utf-8")
-    result = run("init", model, "-o", tmp_path / "a.toml")
-    misused(result, "rigid.xml: the model has no joint")
+def test_a_model_without_joints_is_refused(here: Path) -> None:
+    (here / "rigid.xml").write_text("<mujoco/>", encoding="utf-8")
+    misused(run("init rigid.xml -o a.toml"), "rigid.xml: the model has no joint")
 
 
 @pytest.mark.slow
-def test_init_reads_a_log_of_another_program(tmp_path: Path) -> None:
+def test_init_reads_a_log_of_another_program(here: Path) -> None:
     """The experiment file reads the log as it is, and the next command fits it."""
     (recorded,) = logs_of(cart_pendulum(), 0)
     slide, hinge = recorded.y[:-1, :2].T
     rows = np.column_stack([1e3 * recorded.t[:-1], recorded.ctrl, slide, np.degrees(hinge)])
     lines = ("; ".join(f"{x:.9f}".replace(".", ",") for x in row) for row in rows)
-    log = tmp_path / "robot.csv"
+    log = Path("robot.csv")
     log.write_text("\n".join(("time [ms]; force_cmd; x_slide; hinge [deg]", *lines)), "utf-8")
 
-    file = tmp_path / "robot.toml"
-    result = done("init", MODELS / "cart_pendulum.xml", "--log", log, "-o", file)
-    assert result.stdout.strip() == f"next: mjfim identify {file} {log}"
-    stated = tomllib.loads(file.read_text(encoding="utf-8"))["recording"]
+    result = done("init -o robot.toml --log robot.csv", MODEL)
+    assert result.stdout.strip() == "next: mjfim identify robot.toml robot.csv"
+    stated = tomllib.loads(Path("robot.toml").read_text(encoding="utf-8"))["recording"]
     columns = {"ctrl:force": "force_cmd", "slide_position": "x_slide", "hinge_angle": "hinge"}
     assert stated == {"time": "time", "columns": columns}
-    read = read_recording(log, System.resolve(Experiment.from_file(file)).channels)
+    read = read_recording(log, System.resolve(Experiment.from_file("robot.toml")).channels)
     shown = np.column_stack([1e3 * read.t, read.y[:, 0], np.degrees(read.y[:, 1])])
     assert np.allclose(shown, rows[:, [0, 2, 3]], rtol=0, atol=1e-6)
-    assert run("identify", file, log, "-o", tmp_path / "fit").exit_code in (0, 1)
+    assert run("identify robot.toml robot.csv -o fit").exit_code in (0, 1)
 
 
-def asked(file: Path, *answers: str) -> Result:
+def asked(*answers: str, code: int = 0) -> Result:
     """`mjfim init --ask` for a slide with a pendulum, with these answers."""
-    words = ("init", MODELS / "cart_pendulum.xml", "-o", file, "--ask")
-    return run(*words, answers="".join(f"{each}\n" for each in answers))
+    result = run("init -o asked.toml --ask", MODEL, answers="".join(f"{a}\n" for a in answers))
+    assert result.exit_code == code, result.stderr
+    return result
 
 
 @pytest.mark.slow
-def test_init_writes_a_file_that_validate_accepts(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_init_writes_a_file_that_validate_accepts(here: Path) -> None:
     """Enter takes what it proposes without questions."""
-    monkeypatch.chdir(tmp_path)
-    result = done("init", MODELS / "cart_pendulum.xml")
-    assert "next: mjfim check cart_pendulum.toml" in result.stdout
-    text = (tmp_path / "cart_pendulum.toml").read_text(encoding="utf-8")
+    assert "next: mjfim check cart_pendulum.toml" in done("init", MODEL).stdout
+    text = (here / "cart_pendulum.toml").read_text(encoding="utf-8")
     assert "# A first experiment for" in text
-    assert asked(tmp_path / "asked.toml", *[""] * 5).exit_code == 0
-    assert (tmp_path / "asked.toml").read_text(encoding="utf-8") == text
-
-    valid = done("validate", "cart_pendulum.toml")
-    assert "is correct" in valid.stdout
+    asked(*[""] * 5)
+    assert (here / "asked.toml").read_text(encoding="utf-8") == text
+    assert "is correct" in done("validate cart_pendulum.toml").stdout
 
 
 # Two links of a ROS package, whose meshes are files of it.
@@ -118,37 +81,33 @@ TETRAHEDRON = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 
 
 
 @pytest.mark.slow
-def test_a_urdf_of_a_ros_package_becomes_a_file_that_validate_accepts(tmp_path: Path) -> None:
+def test_a_urdf_of_a_ros_package_becomes_a_file_that_validate_accepts(here: Path) -> None:
     """The written MJCF finds the meshes, and has the motors and the mesh of the URDF."""
-    package, urdf = tmp_path / "elsewhere", tmp_path / "arm.urdf"
-    (package / "meshes").mkdir(parents=True)
-    (package / "meshes" / "a.obj").write_text(TETRAHEDRON, encoding="utf-8")
-    urdf.write_text(PACKAGED, encoding="utf-8")
-    words = ("--package", f"arm_description={package}")
-    file = tmp_path / "first" / "arm.toml"
-    file.parent.mkdir()
-    done("init", urdf, "-o", file, *words)
+    for name, text in {"elsewhere/meshes/a.obj": TETRAHEDRON, "first/arm.urdf": PACKAGED}.items():
+        (here / name).parent.mkdir(parents=True)
+        (here / name).write_text(text, encoding="utf-8")
+    (here / "first" / "arm.urdf").rename(here / "arm.urdf")
+    done("init arm.urdf -o first/arm.toml --package arm_description=elsewhere")
+    file = here / "first" / "arm.toml"
     values = tomllib.loads(file.read_text("utf-8"))
     assert values["limits"]["velocity"] in (3.0, {"shoulder": 3.0})
-    done("validate", file)
+    done("validate first/arm.toml")
     model = System.resolve(Experiment.from_file(file)).model
     assert (model.nu, model.nmesh, model.actuator("shoulder").ctrlrange[1]) == (1, 1, 9.0)
 
 
-def test_the_load_that_is_asked_for_is_an_unknown(tmp_path: Path) -> None:
-    model, file = MODELS / "two_joint_arm.xml", tmp_path / "arm.toml"
-    done("init", model, "-o", file, "--payload", "fore")
-    payload = tomllib.loads(file.read_text("utf-8"))["parameters"]["payload"]
+@pytest.mark.usefixtures("here")
+def test_the_load_that_is_asked_for_is_an_unknown() -> None:
+    done("init -o arm.toml --payload fore", MODELS / "two_joint_arm.xml")
+    payload = tomllib.loads(Path("arm.toml").read_text("utf-8"))["parameters"]["payload"]
     assert payload["targets"][0]["path"] == "body/fore:mass"
-    misused(run("init", model, "-o", tmp_path / "b.toml", "--payload", "hand"), "unknown body")
-    assert not (tmp_path / "b.toml").exists()
 
 
 @pytest.mark.slow
-def test_wrong_answers_are_asked_again(tmp_path: Path) -> None:
+@pytest.mark.usefixtures("here")
+def test_wrong_answers_are_asked_again() -> None:
     answers = ["up", "hanging", "frictions", "friction", "hand", "none", "333", "100", "-1", "3.0"]
-    result = asked(tmp_path / "asked.toml", *answers)
-    assert result.exit_code == 0, result.stderr
+    said = asked(*answers).stderr
     for fault in (
         "unknown keyframe at rest 'up'",
         "unknown group 'frictions'",
@@ -156,50 +115,40 @@ def test_wrong_answers_are_asked_again(tmp_path: Path) -> None:
         "rates nearby: 50, 100",
         "'-1' is no positive number",
     ):
-        assert fault in result.stderr
-    values = tomllib.loads((tmp_path / "asked.toml").read_text("utf-8"))
+        assert fault in said
+    values = tomllib.loads(Path("asked.toml").read_text("utf-8"))
     assert (values["rate"], values["horizon"]) == (100.0, 3.0)
     assert all("damping" in name for name in values["parameters"])
 
 
-def test_answers_that_end_too_early_are_a_misuse(tmp_path: Path) -> None:
-    result = asked(tmp_path / "asked.toml", "", "")
-    assert result.exit_code == 2
-    assert "the input ended before the last question" in result.stderr
-    assert names(tmp_path) == set()
+def test_answers_that_end_too_early_are_a_misuse(here: Path) -> None:
+    said = asked("", "", code=2).stderr
+    assert "the input ended before the last question" in said
+    assert names(here) == set()
 
 
-def test_list_finds_paths_by_a_part_of_their_name() -> None:
-    model = MODELS / "cart_pendulum.xml"
-    found = loads(run("list", model, "damping", "--json").stdout)
-    assert [row["path"] for row in found["parameters"]] == [
-        "joint/slide:damping",
-        "joint/hinge:damping",
-    ]
-    # Brackets are a part of paths.
-    one = loads(run("list", model, "bob:ipos[1]", "--json").stdout)
-    assert [row["path"] for row in one["parameters"]] == ["body/bob:ipos[1]"]
-
-    table = run("list", model, "--kind", "keyframes")
-    assert "hanging" in table.stdout
-    assert "damping" not in table.stdout
-
-    misused(run("list", model, "xyzzy"), "no path or name contains 'xyzzy'")
+@pytest.mark.parametrize(
+    ("part", "paths"),
+    [
+        ("damping", ["joint/slide:damping", "joint/hinge:damping"]),
+        # Brackets are a part of paths.
+        ("bob:ipos[1]", ["body/bob:ipos[1]"]),
+    ],
+)
+def test_list_finds_paths_by_a_part_of_their_name(part: str, paths: list[str]) -> None:
+    found = loads(done("list", MODEL, part, "--json").stdout)
+    assert [row["path"] for row in found["parameters"]] == paths
+    table = done("list", MODEL, "--kind", "keyframes").stdout
+    assert "hanging" in table and "damping" not in table
 
 
-def test_validate_says_what_design_lacks(tmp_path: Path) -> None:
-    file = tmp_path / "log.toml"
-    model = MODELS / "cart_pendulum.xml"
-    file.write_text(
-        f'model = "{model.as_posix()}"\nrate = 100.0\nnoise = {{ state = 0.1 }}\n'
+@pytest.mark.usefixtures("here")
+def test_validate_says_what_design_lacks_and_prints_the_schema() -> None:
+    Path("log.toml").write_text(
+        f'model = "{MODEL.as_posix()}"\nrate = 100.0\nnoise = {{ state = 0.1 }}\n'
         '[parameters.c]\ntarget = "joint/hinge:damping"\n',
         encoding="utf-8",
     )
-    result = done("validate", file, "--json")
-    assert loads(result.stdout)["missing"] == ["horizon", "initial.control"]
-
-
-def test_validate_prints_the_schema() -> None:
-    schema = json.loads(run("validate", "--schema").stdout)
-    assert "model" in schema["properties"]
-    done("validate", code=2)
+    found = loads(done("validate log.toml --json").stdout)
+    assert found["missing"] == ["horizon", "initial.control"]
+    assert "model" in loads(done("validate --schema").stdout)["properties"]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -12,7 +11,6 @@ from rich.console import Console
 from rich.progress import Progress
 
 from mjfim.cli import progress as module
-from mjfim.cli.common import say_written
 from mjfim.cli.progress import ProgressDisplay, clock, progress, say
 from mjfim.excitation.task import DesignTask
 from mjfim.output.progress_text import design_stage, design_text
@@ -27,15 +25,6 @@ def an_iterate(**changes: float) -> DesignEvent:
     numbers = {"cost": 2.0, "criterion": 1.0, "min_eigenvalue": 3.0, "slope": 0.1, "gamma": 1.0}
     numbers |= {"seconds": 1.0, "rate": 50.0, "mu": 0.01, **changes}
     return DesignEvent(start="initial", row=HistoryRow(iteration=7, steps=100, **numbers))  # type: ignore[arg-type]
-
-
-def a_terminal(monkeypatch: pytest.MonkeyPatch, width: int) -> io.StringIO:
-    """What is written on a terminal of some width."""
-    stream = io.StringIO()
-    monkeypatch.setattr(
-        module, "errors", Console(file=stream, force_terminal=True, width=width, highlight=False)
-    )
-    return stream
 
 
 @pytest.mark.parametrize(
@@ -64,23 +53,22 @@ def test_parts_are_counted_where_their_number_is_known() -> None:
     assert task.total is None
 
 
-def test_no_time_is_cut_on_a_narrow_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Long descriptions are folded between words."""
-    stream = a_terminal(monkeypatch, 60)
+def test_texts_are_broken_between_words_and_times_and_paths_stay_whole(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """On a narrow terminal."""
+    stream = io.StringIO()
+    console = Console(file=stream, force_terminal=True, width=60, highlight=False)
+    monkeypatch.setattr(module, "errors", console)
+    path = "/folder/" + "long_name" * 12 + ".toml"
+    say(f"mjfim: {path}: this sentence is longer than a line, because it has so many words")
+    lines = stream.getvalue().splitlines()
+    assert any(path in line for line in lines)
+    assert all(len(line) <= 60 for line in lines if path not in line)
+
     with progress("designing", at_most=4000.0) as display:
         display.show("a description that is so long that it does not fit in one line")
     assert "1:06:40" in stream.getvalue() and "…" not in stream.getvalue()
-
-
-def test_messages_are_broken_between_words_and_paths_stay_whole(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    path = "/folder/" + "long_name" * 12 + ".toml"
-    stream = a_terminal(monkeypatch, 40)
-    say(f"mjfim: {path}: this sentence is longer than a line")
-    lines = stream.getvalue().splitlines()
-    assert any(path in line for line in lines)
-    assert all(len(line) <= 40 for line in lines if path not in line)
 
 
 def test_without_a_terminal_a_line_comes_every_ten_seconds(
@@ -94,14 +82,6 @@ def test_without_a_terminal_a_line_comes_every_ten_seconds(
     lines = capsys.readouterr().err.splitlines()
     assert [line.partition(" J ")[2].split()[0] for line in lines] == ["10", "20", "30"]
     assert lines[0].startswith("searching inside the limits at 50 Hz, barrier")
-
-
-def test_the_report_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    say_written(tmp_path)
-    (tmp_path / "report.html").touch()
-    say_written(tmp_path)
-    first, second = capsys.readouterr().err.replace("\n", " ").split("wrote ")[1:]
-    assert "report.html" not in first and f"see {tmp_path / 'report.html'}" in second
 
 
 def test_a_check_names_its_stages() -> None:

@@ -107,18 +107,6 @@ def test_help_and_misuse_import_nothing_slow() -> None:
 
 
 @pytest.mark.slow
-def test_a_wrong_key_is_said_before_the_engine_is_imported(tmp_path: Path) -> None:
-    wrong = tmp_path / "wrong.toml"
-    wrong.write_text('model = "gone.xml"\nhorizn = 4.0\n')
-    report = imported(
-        [[verb, str(wrong)] for verb in ("check", "validate", "simulate")],
-        tuple(name for name in SLOW if name != "numpy"),
-    )
-    assert [row for row in report if row[2]] == []
-    assert [code for _, code, _ in report] == [0, 2, 2, 2]
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("verb", ["design", "identify", "list", "validate", "check"])
 def test_a_verb_imports_what_it_needs_only(verb: str, tmp_path: Path) -> None:
     """Nothing that draws or fits, where nothing is drawn or fitted."""

@@ -16,7 +16,6 @@ from mjfim.excitation.task import DesignTask
 from mjfim.optimize.lq import regulator
 from mjfim.output import archive
 from mjfim.output.archive import design_columns, reference_columns, simulate_playback
-from mjfim.records.trajectory import Playback
 from tests.fuzz.player import Layout, read_rows
 from tests.support.numerics import Array, body_task, cart_task, filtered_task
 
@@ -43,78 +42,39 @@ def table(path: Path) -> dict[str, Array]:
     return dict(zip(header, values.T, strict=True))
 
 
-def written(task: DesignTask, folder: Path) -> tuple[Path, Playback]:
-    """design.csv of the initial trajectory, with gains."""
-    played = simulate_playback(task.system, task.initial, gains(task))
-    archive.write_table(folder / "design.csv", design_columns(played, task.system))
-    return folder / "design.csv", played
-
-
 def starting(rows: dict[str, Array], prefix: str) -> Array:
     """All columns of a kind, side by side."""
     return np.column_stack([values for name, values in rows.items() if name.startswith(prefix)])
 
 
-def closed_loop(path: Path, folder: Path, push: Array) -> tuple[Array, Array, Array]:
-    """States and controls of a loop that knows only the CSV and the model file, and the planned
-    ones. push: (nx,) of the start
-    """
-    rows = read_rows(path)
-    model = mujoco.MjModel.from_xml_path(str(folder / "model.xml"))
-    data, layout, nv = mujoco.MjData(model), Layout(model), model.nv
-    steps = round(rows[1]["t"] / model.opt.timestep)
-    data.qpos[:], qvel, act = layout.planned(rows[0])
-    data.qvel[:], data.act[:] = qvel + push[nv : 2 * nv], act + push[2 * nv :]
-    mujoco.mj_integratePos(model, data.qpos, push[:nv], 1.0)
-    states, used = [], []
-    for row in rows:
-        states.append(np.concatenate([data.qpos, data.qvel, data.act]))
-        ctrl = np.array([row[f"ctrl:{name}"] for name in layout.drives])
-        ctrl += layout.gain(row) @ layout.deviation(layout.planned(row), data)
-        if np.isfinite(ctrl).all():
-            data.ctrl[:] = ctrl
-            used.append(ctrl)
-            mujoco.mj_step(model, data, steps)
-    plan = [np.concatenate(layout.planned(row)) for row in rows]
-    return np.array(states), np.array(used), np.array(plan)
-
-
 @pytest.mark.parametrize("kind", BUILD)
-def test_the_loop_closed_from_the_table_is_the_projection(kind: str, tmp_path: Path) -> None:
-    """On the plan, at the rate of the controller, it changes nothing: a bare mj_step loop on the
-    model file walks through the positions, velocities and activations of the table. Pushed off it,
-    it is the engine's own loop with the arrays of design.npz.
+def test_the_table_holds_the_plan_and_the_gains(kind: str, tmp_path: Path) -> None:
+    """A bare mj_step loop that knows only the CSV and the model file walks through its states.
+
+    It runs at the rate of the controller. The gains have the names of what they multiply.
     """
     task = BUILD[kind](tmp_path, playback_rate=FINE[kind])
-    path, _ = written(task, tmp_path)
-    nx, rows = task.space.nx, table(path)
-    states, used, plan = closed_loop(path, tmp_path, np.zeros(nx))
-    assert_allclose(states, plan, rtol=0, atol=1e-9)
-    assert len(plan) == round(task.experiment.horizon * FINE[kind]) + 1
-    times = len(used) // len(task.initial.ctrl)
-    assert_allclose(used, np.repeat(task.initial.ctrl, times, axis=0), rtol=0, atol=1e-9)
-    assert_allclose(rows["t"], np.arange(len(plan)) / FINE[kind], rtol=0, atol=1e-12)
-    assert np.isnan(starting(rows, "ctrl:")[-1]).all()
-    assert np.isnan(starting(rows, "gain:")[-1]).all()
-
-    task = BUILD[kind](tmp_path)
-    path, _ = written(task, tmp_path)
-    push = 0.02 * np.random.default_rng(1).standard_normal(nx)
-    states, used, _ = closed_loop(path, tmp_path, push)
-    model = task.plant.model(task.theta)
-    reference = np.array(task.initial.state)
-    expected = engine_loop(task, model, task.space.plus(reference[0], push), reference, gains(task))
-    assert_allclose(states, expected, rtol=0, atol=1e-9)
-    assert np.abs(used - task.initial.ctrl).max() > 1e-3
-
-
-def engine_loop(task: DesignTask, model: Any, start: Array, reference: Array, K: Array) -> Array:
-    """It agrees with single steps of the batch engine and deviations by `StateSpace.minus`."""
-    states = [start]
-    for k in range(len(K)):
-        u = task.initial.ctrl[k] + K[k] @ task.space.minus(reference[k], states[-1])
-        states.append(task.plant.simulator.step([model], states[-1][None], u[None])[0][0])
-    return np.array(states)
+    path, K = tmp_path / "design.csv", gains(task)
+    played = simulate_playback(task.system, task.initial, K)
+    archive.write_table(path, design_columns(played, task.system))
+    model = mujoco.MjModel.from_xml_path(str(tmp_path / "model.xml"))
+    data, layout, rows = mujoco.MjData(model), Layout(model), read_rows(path)
+    times = np.array([row["t"] for row in rows])
+    assert_allclose(times, np.arange(len(rows)) / FINE[kind], rtol=0, atol=1e-12)
+    assert len(rows) == round(task.experiment.horizon * FINE[kind]) + 1
+    repeat = (len(rows) - 1) // len(task.initial.ctrl)
+    data.qpos[:], data.qvel[:], data.act[:] = layout.planned(rows[0])
+    for k, row in enumerate(rows):
+        state = np.concatenate([data.qpos, data.qvel, data.act])
+        assert_allclose(state, np.concatenate(layout.planned(row)), rtol=0, atol=1e-9)
+        ctrl = np.array([row[f"ctrl:{name}"] for name in layout.drives])
+        if k == len(rows) - 1:
+            assert np.isnan([*ctrl, *layout.gain(row).ravel()]).all()
+            continue
+        assert_allclose(ctrl, task.initial.ctrl[k // repeat], rtol=0, atol=1e-9)
+        assert_allclose(layout.gain(row), K[k // repeat], rtol=1e-12)
+        data.ctrl[:] = ctrl
+        mujoco.mj_step(model, data, round(times[1] / model.opt.timestep))
 
 
 @pytest.mark.parametrize("kind", BUILD)

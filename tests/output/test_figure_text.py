@@ -16,8 +16,7 @@ from mjfim.output.plots.draw import figure_of
 from mjfim.output.plots.pictures import pictures_of
 from mjfim.records.base import ShownRecord
 from mjfim.records.design import CombinationAccuracy, Design, LimitUsage
-from mjfim.records.estimate import Estimate, HorizonStudy, Whiteness
-from mjfim.records.estimate_parts import InformationInTime, ResidualForce
+from mjfim.records.estimate import Estimate, Whiteness
 from mjfim.records.rehearsal import Separation, Valley
 from mjfim.records.terms import Decision, Selection, SelectionStep
 from tests.support import results
@@ -38,14 +37,10 @@ NAMES = make_labels(1, 3, LONG).parameters
 def design(joints: int, count: int, width: int) -> Design:
     """A design with limits on all joints, and two robots that part in its motion."""
     labels, t = make_labels(joints, count, width), np.linspace(0.0, 2.0, 400)
+    speeds = {"position": 3.0, "velocity": 3.0, "force": 200.0, "control": 3.0}
     usage = [
         LimitUsage(kind=kind, name=label.partition(" ")[0], t=t, share=np.sin(speed * t + i))
-        for kind, speed in (
-            ("position", 3.0),
-            ("velocity", 3.0),
-            ("force", 200.0),
-            ("control", 3.0),
-        )
+        for kind, speed in speeds.items()
         for i, label in enumerate(labels.positions)
     ]
     motion, designed = (
@@ -115,11 +110,11 @@ def estimate(joints: int, count: int, width: int) -> Estimate:
         nominal=(1.3 * made.predicted[0],),
         segments=(np.arange(0.0, 2.0, 0.25),),
         selection=selection(joints),
-        horizons=horizons(made, names, units),
+        horizons=results.horizons(made.theta, names, units),
         recording_comparison=make_recording_comparison(names, units, files),
         draws=draws,
-        residual_forces=residual_forces(joints, width),
-        in_time=information_in_time(names),
+        residual_forces=results.residual_forces(*("n" * width + str(k) for k in range(joints))),
+        in_time=results.information_in_time(names, 2.0),
         misfit=True,
     )
 
@@ -129,58 +124,14 @@ def selection(count: int) -> Selection:
     begun = SelectionStep(decision=Decision.BEGUN, error=2.0)
     steps = [begun]
     for i in range(1, count + 1):
-        tried = replace(begun, description=f"viscous damping of joint number {i}", count=i)
         error = 1.0 + 1.0 / (i + 1)
+        tried = replace(begun, description=f"viscous damping of joint number {i}", count=i)
         steps.append(replace(tried, decision=Decision.REJECTED, error=error + 0.05))
         steps.append(replace(tried, decision=Decision.ADDED, error=error))
-    last = {"count": count, "error": 0.5}
-    steps.append(
-        replace(begun, decision=Decision.SHORTENED, description="segments of 0.5 s", **last)
-    )
-    steps.append(replace(begun, decision=Decision.ADDED, description="a delay", **last))
+    last = replace(begun, count=count, error=0.5, description="segments of 0.5 s")
+    steps.append(replace(last, decision=Decision.SHORTENED))
+    steps.append(replace(last, decision=Decision.ADDED, description="a delay"))
     return Selection(terms=(), steps=tuple(steps), ending="No further term is significant.")
-
-
-def horizons(made: Estimate, names: tuple[str, ...], units: tuple[str, ...]) -> HorizonStudy:
-    """Four lengths of segments, on which some parameters depend."""
-    theta = np.outer([1.2, 1.1, 1.0, 0.9], made.theta)
-    apart = np.zeros(theta.shape, dtype=bool)
-    apart[0, ::2] = True
-    return HorizonStudy(
-        lengths=np.array([0.12, 0.48, 1.9, 4.0]),
-        errors=np.array([1.1, 1.2, 1.8, 5.0]) * np.ones((4, 1)),
-        chosen=2,
-        is_whole=True,
-        parameters=names,
-        units=units,
-        theta=theta,
-        half_widths=0.05 * theta,
-        is_apart=apart,
-    )
-
-
-def residual_forces(count: int, width: int) -> tuple[ResidualForce, ...]:
-    """Residual forces of as many joints."""
-    speed = np.sin(np.linspace(0.0, 40.0, 300))
-    force = np.sign(speed) + 0.1 * np.random.default_rng(1).normal(size=300)
-    curves = {"position": np.cumsum(speed), "speed": speed, "force": force}
-    return tuple(
-        ResidualForce(joint="n" * width + str(k), unit="N m", sigma=0.1, size=2.0, **curves)
-        for k in range(count)
-    )
-
-
-def information_in_time(names: tuple[str, ...]) -> InformationInTime:
-    """Information of ten blocks of the recording."""
-    edges, shape = np.linspace(0.0, 2.0, 11), (10, len(names))
-    return InformationInTime(
-        parameters=names,
-        recording=np.zeros(10),
-        times=np.column_stack([edges[:-1], edges[1:]]),
-        shares=np.full(shape, 0.09),
-        pulls=np.resize([-2.0, 2.0], shape),
-        scatter=1.0,
-    )
 
 
 def named(verb: str) -> ShownRecord:

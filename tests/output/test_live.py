@@ -12,7 +12,6 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 from unittest.mock import Mock
 
 import numpy as np
@@ -21,7 +20,6 @@ from numpy.testing import assert_allclose
 
 pytest.importorskip("rerun")
 import rerun as rr
-from rerun.chunk import RrdReader
 
 import mjfim
 from mjfim.cli.common import with_live_address
@@ -34,6 +32,7 @@ from mjfim.records.design import Design
 from mjfim.records.events import DesignEvent, Event, FitEvent, StudyEvent
 from tests.support import results
 from tests.support.paths import MODELS
+from tests.support.rrd import Recorded
 
 
 @pytest.fixture(scope="module")
@@ -54,40 +53,6 @@ def searched(experiment: mjfim.Experiment) -> Searched:
     return mjfim.design(experiment, callback=events.append), events
 
 
-class Received:
-    """What a viewer would receive, read back from a file."""
-
-    def __init__(self, path: Path) -> None:
-        self._batches = [
-            (str(chunk.entity_path), chunk.to_record_batch())
-            for chunk in RrdReader(path).stream().to_chunks()
-        ]
-        self.entities = {entity for entity, _ in self._batches}
-
-    def rows(self, entity: str, component: str) -> tuple[list[int], list[Any]]:
-        """Numbers of the events and values of a component, in the order of the events."""
-        found: list[tuple[int, Any]] = []
-        for at, batch in self._batches:
-            if at == entity and {component, "event"} <= {*batch.schema.names}:
-                numbers = batch.column("event").cast("int64").to_pylist()
-                found += zip(numbers, batch.column(component).to_pylist(), strict=True)
-        found.sort(key=lambda row: row[0])
-        return [number for number, _ in found], [value for _, value in found]
-
-    def series(self, entity: str) -> list[float]:
-        """Values of a curve."""
-        return [value for (value,) in self.rows(entity, "Scalars:scalars")[1]]
-
-    def names(self, plot: str) -> dict[str, str]:
-        """Names of the curves of a plot in the legend, by entity; the last ones received."""
-        component = "SeriesLines:names"
-        return {
-            at: batch.column(component).to_pylist()[-1][0]
-            for at, batch in self._batches
-            if at.startswith(f"/{plot}/") and component in batch.schema.names
-        }
-
-
 def watched(
     events: Sequence[Event],
     experiment: mjfim.Experiment,
@@ -95,7 +60,7 @@ def watched(
     step: float = 2.0 * UPDATE_SECONDS,
     end: Callable[[LiveShow], None] = LiveShow.end,
     **options: bool,
-) -> Received:
+) -> Recorded:
     """Transmit events into a file, with a clock that moves on by a step whenever it is read."""
     system = System.resolve(experiment)
     rec = rr.RecordingStream("test")
@@ -108,29 +73,33 @@ def watched(
     rec.flush()
     rec.disconnect()
 
-    received = Received(folder / "live.rrd")
-    assert not any("warnings" in entity for entity in received.entities)
-    return received
+    return Recorded(folder / "live.rrd", "event")
+
+
+def series(received: Recorded, entity: str) -> list[float]:
+    """Values of a curve."""
+    values: list[float] = received.scalars(entity)[1].tolist()
+    return values
 
 
 @pytest.fixture(scope="module")
 def received(
     searched: Searched, experiment: mjfim.Experiment, tmp_path_factory: pytest.TempPathFactory
-) -> Received:
+) -> Recorded:
     """What a viewer receives from the whole design."""
     return watched(searched[1], experiment, tmp_path_factory.mktemp("live"))
 
 
 def test_every_iterate_of_a_design_changes_curves_robot_and_path(
-    searched: Searched, received: Received
+    searched: Searched, received: Recorded
 ) -> None:
     design, events = searched
     for plot, field in (("cost", "cost"), ("eigenvalue", "min_eigenvalue")):
         expected = np.log10([getattr(row, field) for row in design.history])
-        assert_allclose(received.series(f"/{plot}/initial\\ control"), expected)
+        assert_allclose(series(received, f"/{plot}/initial\\ control"), expected)
 
     numbers, paths = received.rows("/robot/path", "LineStrips3D:strips")
-    assert numbers == list(range(len(events)))
+    assert numbers.tolist() == list(range(len(events)))
     assert all(np.isfinite(path).all() for path in paths)
     assert not np.allclose(paths[0], paths[-1])
     _, texts = received.rows("/progress", "TextDocument:text")
@@ -140,31 +109,29 @@ def test_every_iterate_of_a_design_changes_curves_robot_and_path(
     assert len(places) == len(events)
 
 
+@pytest.mark.parametrize("name", ["positions/hinge\\ \\[rad\\]", "controls/force\\ \\[N\\]"])
 def test_curves_over_time_show_the_positions_and_the_controls(
-    searched: Searched, received: Received
+    name: str, searched: Searched, received: Recorded
 ) -> None:
     design, events = searched
-    t = design.trajectory.t
-    for entity, expected in (
-        ("/positions/hinge\\ \\[rad\\]", design.trajectory.qpos[:, 1]),
-        ("/controls/force\\ \\[N\\]", design.trajectory.ctrl[:, 0]),
-    ):
-        numbers, curves = received.rows(f"{entity}/iterate", "LineStrips2D:strips")
-        assert numbers == list(range(len(events)))
-        x, y = np.array(curves[-1][0]).T
-        shown = np.interp((x - x[0]) / np.ptp(x) * t[-1], t[: len(expected)], expected)
-        # Rerun draws downwards.
-        assert np.corrcoef(shown, -y)[0, 1] > 0.99
+    curve = design.trajectory
+    expected = curve.qpos[:, 1] if "hinge" in name else curve.ctrl[:, 0]
+    numbers, curves = received.rows(f"/{name}/iterate", "LineStrips2D:strips")
+    assert numbers.tolist() == list(range(len(events)))
+    x, y = np.array(curves[-1][0]).T
+    shown = np.interp((x - x[0]) / np.ptp(x) * curve.t[-1], curve.t[: len(expected)], expected)
+    # Rerun draws downwards.
+    assert np.corrcoef(shown, -y)[0, 1] > 0.99
 
-        # The axes hold everything that was shown before, and their numbers are about the values.
-        _, axes = received.rows(f"{entity}/axes", "LineStrips2D:strips")
-        assert len(axes) == len(events)
-        assert 0.2 < np.ptp(y) / np.ptp(np.array(axes[-1][0])[:, 1]) <= 1.0
-        _, texts = received.rows(f"{entity}/numbers", "Points2D:labels")
-        _, places = received.rows(f"{entity}/numbers", "Points2D:positions")
-        beside = [float(text) for text, (x, _) in zip(texts[-1], places[-1], strict=True) if x < 0]
-        middle, size = np.mean(expected), 2.0 * np.ptp(expected)
-        assert len(beside) > 1 and np.abs(np.array(beside) - middle).max() < size
+    # The axes hold everything that was shown before, and their numbers are about the values.
+    _, axes = received.rows(f"/{name}/axes", "LineStrips2D:strips")
+    assert len(axes) == len(events)
+    assert 0.2 < np.ptp(y) / np.ptp(np.array(axes[-1][0])[:, 1]) <= 1.0
+    _, texts = received.rows(f"/{name}/numbers", "Points2D:labels")
+    _, places = received.rows(f"/{name}/numbers", "Points2D:positions")
+    beside = [float(text) for text, (x, _) in zip(texts[-1], places[-1], strict=True) if x < 0]
+    assert len(beside) > 1
+    assert np.abs(np.array(beside) - np.mean(expected)).max() < 2.0 * np.ptp(expected)
 
 
 def test_the_best_iterate_of_several_starts_is_shown(
@@ -190,7 +157,8 @@ def test_the_best_iterate_of_several_starts_is_shown(
     assert np.allclose(paths[1], paths[2:4]) and not np.allclose(paths[0], paths[1])
 
     # The curves of other starts share a name in the legend.
-    legend = sorted(received.names("cost").values())
+    curves = [name for name in received.entities if name.startswith("/cost/")]
+    legend = sorted(received.static(name, "SeriesLines:names")[-1][0] for name in curves)
     assert legend == sorted(["multisine 4", *[OTHER_STARTS] * 4])
 
 
@@ -200,31 +168,27 @@ def test_the_end_of_a_burst_is_transmitted_without_a_further_event(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Searches in other processes deliver all iterates at once, and then nothing."""
+    """Searches in other processes deliver all iterates at once, and then nothing.
+
+    A clock that stands still gives one transmission at the begin and one at the end.
+    """
     timer = Mock()
     monkeypatch.setattr(threading, "Timer", timer)
 
     def wake(show: LiveShow) -> None:
         """The time of the timer is over."""
         timer.assert_called_once()
+        timer.return_value.start.assert_called_once()
         seconds, update = timer.call_args.args
         assert seconds == UPDATE_SECONDS and timer.return_value.daemon is True
         update()
 
-    received = watched(searched[1], experiment, tmp_path, step=0.0, end=wake, wakes=True)
-    numbers, _ = received.rows("/robot/path", "LineStrips3D:strips")
-    assert numbers == [0, len(searched[1]) - 1]
-
-
-def test_transmissions_are_rare_and_lose_no_point(
-    searched: Searched, experiment: mjfim.Experiment, tmp_path: Path
-) -> None:
-    """A clock that stands still gives one transmission at the begin and one at the end."""
     many = 20 * searched[1]
-    received = watched(many, experiment, tmp_path, step=0.0)
-    assert len(received.series("/cost/initial\\ control")) == len(many)
-    numbers, _ = received.rows("/robot/path", "LineStrips3D:strips")
-    assert numbers == [0, len(many) - 1]
+    for end, options in ((wake, {"wakes": True}), (LiveShow.end, {})):
+        received = watched(many, experiment, tmp_path, step=0.0, end=end, **options)
+        numbers, _ = received.rows("/robot/path", "LineStrips3D:strips")
+        assert numbers.tolist() == [0, len(many) - 1]
+        assert len(series(received, "/cost/initial\\ control")) == len(many)
 
 
 def test_fits_studies_and_streams_have_their_curves(
@@ -246,13 +210,13 @@ def test_fits_studies_and_streams_have_their_curves(
     ]
     events = [*fits, part, replace(part, index=1), *streams]
     received = watched(events, experiment, tmp_path, step=1.0)
-    assert received.series("/squares/all\\ data") == pytest.approx([0.0, -1.0, -2.0, -3.0])
-    assert received.series("/step/all\\ data") == pytest.approx([-1.0] * 3)
-    assert received.series("/share/monte_carlo") == pytest.approx([25.0, 75.0])
+    assert series(received, "/squares/all\\ data") == pytest.approx([0.0, -1.0, -2.0, -3.0])
+    assert series(received, "/step/all\\ data") == pytest.approx([-1.0] * 3)
+    assert series(received, "/share/monte_carlo") == pytest.approx([25.0, 75.0])
     for j, name in enumerate(record.parameters):
         shares = record.std_over_time[[19, 59], j] / record.wanted[j]
-        assert received.series(f"/accuracy/{name}") == pytest.approx(np.log10(shares))
-    assert received.series("/accuracy/wanted") == [0.0, 0.0]
+        assert series(received, f"/accuracy/{name}") == pytest.approx(np.log10(shares))
+    assert series(received, "/accuracy/wanted") == [0.0, 0.0]
 
 
 def free_port() -> int:

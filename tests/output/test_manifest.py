@@ -28,6 +28,11 @@ def write(path: Path, text: str, *inputs: Path, force: bool = False) -> None:
         temporary.write_text(text, encoding="utf-8")
 
 
+def contents(folder: Path) -> dict[str, bytes]:
+    """Contents of the files of a folder by their names."""
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
 def test_a_result_is_replaced_until_the_user_edits_it(tmp_path: Path) -> None:
     """After an edit it is the user's; --force makes it a result again."""
     file = tmp_path / "out" / "a.txt"
@@ -95,25 +100,23 @@ def test_a_file_that_appears_during_the_run_is_kept(tmp_path: Path) -> None:
         replacing(tmp_path / "a.txt"),
     ):
         pass
-    assert [path.name for path in tmp_path.iterdir()] == ["a.txt"]
-    assert (tmp_path / "a.txt").read_text(encoding="utf-8") == "mine"
+    assert contents(tmp_path) == {"a.txt": b"mine"}
 
 
 def test_only_earlier_results_are_removed(tmp_path: Path) -> None:
     """Neither the user's files, nor inputs, nor anything without a rule."""
-    for name in ("result", "changed", "input"):
+    names = ("result", "changed", "input", "unknown")
+    for name in names[:3]:
         write(tmp_path / name, "text")
-    (tmp_path / "changed").write_text("mine", encoding="utf-8")
-    (tmp_path / "unknown").write_text("mine", encoding="utf-8")
+    for name in ("changed", "unknown"):
+        (tmp_path / name).write_text("mine", encoding="utf-8")
 
     remove_earlier_result(tmp_path / "result")
     assert (tmp_path / "result").exists()
-
-    guard = OutputGuard([tmp_path / "input"], force=True)
-    with claimed(tmp_path, guard, exclusive=True):
-        for name in ("result", "changed", "input", "unknown"):
+    with claimed(tmp_path, OutputGuard([tmp_path / "input"], force=True), exclusive=True):
+        for name in names:
             remove_earlier_result(tmp_path / name)
-    assert {path.name for path in tmp_path.iterdir()} == {MANIFEST, "changed", "input", "unknown"}
+    assert contents(tmp_path).keys() == {MANIFEST, *names[1:]}
 
 
 def test_a_run_that_is_killed_while_it_writes_leaves_no_strange_file(tmp_path: Path) -> None:
@@ -124,7 +127,6 @@ def test_a_run_that_is_killed_while_it_writes_leaves_no_strange_file(tmp_path: P
     guard = OutputGuard([], force=False)
     guard.before_replacing(new, file)
     guard.check([file])
-
     new.replace(file)
     guard.check([file])
 
@@ -133,10 +135,13 @@ def test_the_manifest_has_one_entry_per_file(tmp_path: Path) -> None:
     """Runs of several verbs keep each other's entries; no temporary file and no lock remains."""
     for name in ("a.txt", "b.txt", "a.txt"):
         write(tmp_path / name, name)
-    files = json.loads((tmp_path / MANIFEST).read_text(encoding="utf-8"))["files"]
-    sizes = {name: [entry["size"] for entry in entries] for name, entries in files.items()}
-    assert sizes == {"a.txt": [5], "b.txt": [5]}
-    assert {path.name for path in tmp_path.iterdir()} == {MANIFEST, "a.txt", "b.txt"}
+    found = contents(tmp_path)
+    entries = json.loads(found[MANIFEST])["files"]
+    assert {name: [entry["size"] for entry in each] for name, each in entries.items()} == {
+        "a.txt": [5],
+        "b.txt": [5],
+    }
+    assert found.keys() == {MANIFEST, *entries}
 
 
 def test_a_folder_that_cannot_be_created_is_named(tmp_path: Path) -> None:
@@ -157,28 +162,21 @@ def test_a_second_run_is_kept_out_of_a_folder(tmp_path: Path) -> None:
     said = rf"out: another run .*process {os.getpid()}, since 20\d\d-"
     with claimed(folder, guard, exclusive=True):
         for _ in range(2):
-            with (
-                pytest.raises(OutputError, match=said),
-                claimed(folder, guard, exclusive=True),
-            ):
+            with pytest.raises(OutputError, match=said), claimed(folder, guard, exclusive=True):
                 pass
         assert (folder / FOLDER_LOCK).is_file()
     assert list(tmp_path.iterdir()) == []
 
 
-def test_the_lock_of_a_killed_run_is_taken_over(tmp_path: Path) -> None:
+@pytest.mark.parametrize("text", ["1 2026-01-01", "", "1", "who knows"])
+def test_the_lock_of_a_killed_run_is_taken_over(text: str, tmp_path: Path) -> None:
     """Its file remains, but the operating system has given the lock back."""
     lock = tmp_path / FOLDER_LOCK
-    lock.write_text("1 2026-01-01", encoding="utf-8")
+    lock.write_text(text, encoding="utf-8")
+    assert holder(lock) == ("process 1, since 2026-01-01" if " 2" in text else "another process")
     with locked(lock) as is_mine:
         assert is_mine
         assert holder(lock).startswith(f"process {os.getpid()}, since ")
         with locked(lock, patience=0.05) as is_mine_too:
             assert not is_mine_too
     assert list(tmp_path.iterdir()) == []
-
-
-def test_a_lock_file_without_a_holder_is_described(tmp_path: Path) -> None:
-    for text in ("", "1", "who knows"):
-        (tmp_path / "lock").write_text(text, encoding="utf-8")
-        assert holder(tmp_path / "lock") == "another process"

@@ -17,7 +17,6 @@ import mjfim
 from mjfim.errors import MjfimError, OutputError
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.packing import with_model
-from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
 from mjfim.files import write_json
 from mjfim.model.given import same_dynamics
@@ -306,33 +305,16 @@ UNCHANGED = [
 def test_without_a_change_every_number_keeps_its_spelling(
     more: tuple[str, ...], tmp_path: Path
 ) -> None:
-    system = system_of(RICH, tmp_path, *(p for p in UNCHANGED if p != 'body/b "2":mass'), *more)
-    assert changes(tmp_path / "model.xml", written(system, *system.parameters.guess)) == ([], [])
+    paths = [*(p for p in UNCHANGED if p != 'body/b "2":mass'), *more]
+    system = system_of(RICH, tmp_path, *paths)
+    same = written(system, *system.parameters.guess)
+    assert changes(tmp_path / "model.xml", same) == ([], [])
 
-
-def test_an_identified_file_reproduces_itself(tmp_path: Path) -> None:
-    """A written file has the identified values; identified again, it does not change."""
-    paths = [p for p in UNCHANGED if p != 'body/b "2":mass']
-    paths += ["body/a:firstmoment[0]", "body/c:fullinertia[3]"]
-    first = system_of(RICH, tmp_path, *paths)
-    theta = first.parameters.guess * 1.013 + 1e-3 / 3
-    new = written(first, *theta)
-    (tmp_path / "again").mkdir()
-    second = system_of(new, tmp_path / "again", *paths)
-    straight = np.array([":rot" not in p for p in paths])
-    found = second.parameters.guess
-    assert_allclose(found[straight], theta[straight], rtol=1e-12, atol=1e-13)
-    assert write_identified(tmp_path / "again.xml", second, found) == []
+    # A written file has the identified values; identified again, it does not change.
+    new = written(system, *(system.parameters.guess * 1.0001 + 1e-7 / 3))
+    again = system_of(new, tmp_path, *(spec for spec in paths if ":rot" not in spec))
+    assert write_identified(tmp_path / "again.xml", again, again.parameters.guess) == []
     assert (tmp_path / "again.xml").read_bytes() == new.read_bytes()
-
-
-def test_scale_and_offset_reach_every_target(tmp_path: Path) -> None:
-    other = {"path": "joint/k:damping", "scale": 2.0, "offset": 0.25}
-    both = {"targets": [{"path": "joint/j:damping"}, other], "guess": 0.3}
-    system = system_of(RICH, tmp_path, both)
-    _, gained = changes(tmp_path / "model.xml", written(system, 0.125))
-    assert len(gained) == 2
-    assert 'damping="0.125"' in gained[0] and 'damping="0.5 0.020"' in gained[1]
 
 
 @pytest.mark.parametrize("ending", ["\n", "\r\n"])
@@ -350,45 +332,6 @@ def test_texts_of_other_systems(ending: str, tmp_path: Path) -> None:
     assert (lost, len(gained)) == ([], 1)
 
 
-REPLICA = """<replicate count="2" offset="1 0 0">
-  <body name="r" pos="2 2 0"><joint name="rj"/><geom size=".1"/></body>
-</replicate>
-"""
-LEG = """<mujoco model="leg">
-  <worldbody><body name="d"><joint name="dj"/><geom size=".1"/></body></worldbody>
-</mujoco>
-"""
-
-
-@pytest.mark.parametrize(
-    ("place", "path"),
-    [
-        (REPLICA, "joint/rj1:damping"),
-        ('<attach model="leg" body="d" prefix="x_"/>', "joint/x_dj:damping"),
-        (
-            '<frame euler="0 0 9"><body name="e"><joint/><geom size=".1"/></body></frame>',
-            "body/e:pos[0]",
-        ),
-    ],
-    ids=["replicate", "attach", "turned frame"],
-)
-def test_mujoco_prints_values_that_the_text_cannot_express(
-    place: str, path: str, tmp_path: Path
-) -> None:
-    """The print has all digits of the elements that have names."""
-    (tmp_path / "leg.xml").write_text(LEG, encoding="utf-8")
-    asset = '<asset><model name="leg" file="leg.xml"/></asset>'
-    xml = RICH.replace("  <worldbody>", f"{asset}  <worldbody>")
-    xml = xml.replace("  </worldbody>", f"{place}</worldbody>")
-    system = system_of(xml, tmp_path, {"target": path, "guess": 0.5, "scale": 1.0})
-    value = 0.6 + 1e-9
-    new = written(system, value, said="it is printed by MuJoCo, without comments")
-    found = compiled(new)
-    wanted = system.model_at(np.array([value]))
-    for name in ("dof_damping", "body_pos", "body_mass", "actuator_gainprm"):
-        assert_allclose(getattr(found, name), getattr(wanted, name), rtol=1e-12, atol=1e-12)
-
-
 @pytest.mark.parametrize(("attribute", "said"), [("armature", ""), ("margin", "jnt_margin")])
 def test_functions_of_the_spec(attribute: str, said: str, tmp_path: Path) -> None:
     """A text states the numbers that a function changes; MuJoCo prints other changes."""
@@ -399,17 +342,6 @@ def test_functions_of_the_spec(attribute: str, said: str, tmp_path: Path) -> Non
     system = system_of(RICH, tmp_path, {"function": function, "guess": 0.1, "scale": 1.0})
     found = compiled(written(system, 0.25, said=said))
     assert same_dynamics(found, system.model_at(np.array([0.25])))
-
-
-@pytest.mark.parametrize("path", ["body/c:pos[0]", "body/c:rot[1]", "site/u:pos[2]"])
-def test_poses_inside_frames(path: str, tmp_path: Path) -> None:
-    frames = '<frame pos="1 2 3" quat="0.6 0.8 0 0"><frame quat="0.8 0 0.6 0"><body name="c" '
-    xml = RICH.replace('<body name="c" ', frames)
-    xml = xml.replace("</body>\n  </worldbody>", "</body></frame></frame>\n  </worldbody>")
-    system = system_of(xml, tmp_path, path)
-    new = written(system, 0.3)
-    assert_is_identified_model(new, system, [0.3])
-    assert len(changes(tmp_path / "model.xml", new)[1]) == 1
 
 
 MESH = "v 0 0 0\nv 0.2 0 0\nv 0 0.3 0\nv 0 0 0.4\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
@@ -453,8 +385,43 @@ def test_meshes_are_found_from_another_folder(
         assert_is_identified_model(path, system, theta)
 
 
-# Numbers that the compiler would derive: (old, new) text, path, value, and what is stated.
-DERIVED = {
+# Elements inside frames, a copied one and an attached one.
+FIRST, LAST = RICH.index('    <body name="c" '), RICH.index("  </worldbody>")
+FRAMES = (
+    '<frame pos="1 2 3" quat="0.6 0.8 0 0"><frame quat="0.8 0 0.6 0">'
+    f"{RICH[FIRST:LAST]}</frame></frame>"
+)
+FRAMED = (RICH[FIRST:LAST], FRAMES)
+REPLICA = """<replicate count="2" offset="1 0 0">
+  <body name="r" pos="2 2 0"><joint name="rj"/><geom size=".1"/></body>
+</replicate>
+"""
+TURNED = '<frame euler="0 0 9"><body name="e"><joint/><geom size=".1"/></body></frame>'
+ATTACHED = '<attach model="leg" body="d" prefix="x_"/>'
+LEG = """<mujoco model="leg">
+  <worldbody><body name="d"><joint name="dj"/><geom size=".1"/></body></worldbody>
+</mujoco>
+"""
+BOTH = [{"path": "joint/j:damping"}, {"path": "joint/k:damping", "scale": 2.0, "offset": 0.25}]
+
+# (old, new) text, path, value, and words that state the value; "" where MuJoCo prints the model:
+# numbers that the compiler would derive, and those that the text cannot express.
+DERIVED: dict[str, tuple[tuple[str, str], tuple[Any, float], str]] = {
+    "scale and offset": (("", ""), (BOTH, 0.125), 'damping="0.5 0.020"'),
+    "place in frames": (FRAMED, ("body/c:pos[0]", 0.3), '<body name="c" pos="'),
+    "rotation in frames": (FRAMED, ("body/c:rot[1]", 0.3), '<body name="c" pos="'),
+    "site in frames": (FRAMED, ("site/u:pos[2]", 0.3), '<site name="u" pos="0 0 0.3"'),
+    "replica": ((RICH[LAST:], REPLICA + RICH[LAST:]), ("joint/rj1:damping", 0.6 + 1e-9), ""),
+    "turned frame": ((RICH[LAST:], TURNED + RICH[LAST:]), ("body/e:pos[0]", 0.6 + 1e-9), ""),
+    "attached": (
+        (
+            RICH[LAST:],
+            f'{ATTACHED}</worldbody><asset><model name="leg" file="leg.xml"/></asset><worldbody>'
+            f"{RICH[LAST:]}",
+        ),
+        ("joint/x_dj:damping", 0.6 + 1e-9),
+        "",
+    ),
     "damping ratio": (
         ('kp="12.0" kv="0.60"', 'kp="12.0" dampratio="1"'),
         ('body/b "2":mass', 2.0),
@@ -511,15 +478,22 @@ for element, field, stated in (
 
 
 @pytest.mark.parametrize("case", DERIVED)
-def test_numbers_that_the_compiler_would_derive_are_stated(case: str, tmp_path: Path) -> None:
+def test_numbers_that_are_not_in_the_text_are_stated_or_printed(case: str, tmp_path: Path) -> None:
+    """The print has all digits of the elements that have names."""
     (old, new), (path, value), words = DERIVED[case]
     assert old in RICH
-    target = {"target": path, "guess": value, "scale": 1.0}
-    system = system_of(RICH.replace(old, new, 1), tmp_path, target)
-    file = written(system, value, said="" if words else "printed by MuJoCo")
+    target: dict[str, Any] = {"target": path} if isinstance(path, str) else {"targets": path}
+    (tmp_path / "leg.xml").write_text(LEG, encoding="utf-8")
+    changed = RICH.replace(old, new, 1)
+    system = system_of(changed, tmp_path, {**target, "guess": value, "scale": 1.0})
+    file = written(system, value, said="" if words else "printed by MuJoCo, without comments")
     if words:
         assert words in " ".join(changes(tmp_path / "model.xml", file)[1])
         assert_is_identified_model(file, system, [value])
+    else:
+        found, wanted = compiled(file), system.model_at(np.array([value]))
+        for name in ("dof_damping", "body_pos", "body_mass", "actuator_gainprm"):
+            assert_allclose(getattr(found, name), getattr(wanted, name), rtol=1e-12, atol=1e-12)
 
 
 @pytest.mark.parametrize("turned", ["", ' euler="10 20 30"', ' quat="0.6 0.8 0 0"'])
@@ -577,13 +551,10 @@ def test_models_of_this_and_other_projects(name: str, tmp_path: Path) -> None:
 def test_what_counts_as_rounding_does_not_depend_on_units(
     one: tuple[float, float], other: tuple[float, float], same: bool
 ) -> None:
+    body = '<body><joint armature="{!r}"/><geom size="0.1"/></body>'
     first, second = (
         mujoco.MjModel.from_xml_string(
-            "<mujoco><worldbody>"
-            + "".join(
-                f'<body><joint armature="{a!r}"/><geom size="0.1"/></body>' for a in armatures
-            )
-            + "</worldbody></mujoco>"
+            f"<mujoco><worldbody>{''.join(map(body.format, armatures))}</worldbody></mujoco>"
         )
         for armatures in (one, other)
     )
@@ -594,25 +565,19 @@ def test_what_counts_as_rounding_does_not_depend_on_units(
     assert same_dynamics(first, second) == same
 
 
-# An experiment with a model of several files.
-MESH_EXPERIMENT: dict[str, Any] = {
-    "rate": 50.0,
-    "parameters": {"mass": "body/tool:mass"},
-    "noise": {"angle": 0.01},
-}
-
-
 def test_a_model_in_memory_is_written_with_the_files_that_it_needs(tmp_path: Path) -> None:
     """A spec with meshes, one of which is attached from a folder that it does not know any more."""
     spec = mujoco.MjSpec.from_file(str(write_mesh_model(tmp_path / "robot")))
-    stated = {**MESH_EXPERIMENT, "model": spec, "directory": tmp_path / "nowhere"}
-    system = System.resolve(Experiment(**stated))
-    file = tmp_path / "out" / "identified.xml"
-
+    stated = mjfim.Experiment(
+        model=spec,
+        directory=tmp_path / "nowhere",
+        rate=50.0,
+        parameters={"mass": "body/tool:mass"},
+        noise={"angle": 0.01},
+    )
+    system, file = System.resolve(stated), tmp_path / "out" / "identified.xml"
     assert write_identified(file, system, np.array([1.5])) == []
-
-    found = compiled(file)
-    assert same_dynamics(found, system.model_at(np.array([1.5])))
+    assert same_dynamics(compiled(file), system.model_at(np.array([1.5])))
     assert [each.name for each in file.parent.iterdir()] == [file.name]
 
 

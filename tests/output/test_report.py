@@ -36,8 +36,6 @@ from mjfim.output.plots.plotly import group_of, packed, thinned
 from mjfim.output.report import KINDS, Media, media_in, report_of, write_report
 from mjfim.output.video import Video
 from mjfim.records.base import ShownRecord
-from mjfim.records.design import LimitUsage
-from mjfim.records.estimate import HorizonStudy
 from tests.support import results
 
 # A name that would change the page, or run, if it were not escaped.
@@ -142,10 +140,9 @@ def test_a_design_shows_its_tables_and_curves() -> None:
     """The values of a curve are those of the trajectory."""
     html = html_of("design")
     assert '<td data-label="change of σ">÷ 10.0</td>' in html
-    curves = [
-        t for p in data_of(html)["panels"] for t in p["traces"] if t.get("name") == "designed"
-    ]
-    position = next(t for t in curves if len(numbers(t["y"])) == 51)
+    traces = [trace for panel in data_of(html)["panels"] for trace in panel["traces"]]
+    curves = [trace for trace in traces if trace.get("name") == "designed"]
+    position = next(curve for curve in curves if len(numbers(curve["y"])) == 51)
     assert numbers(position["x"])[-1] == pytest.approx(results.design().trajectory.t[-1])
 
 
@@ -217,27 +214,21 @@ def test_thinning_keeps_the_peaks() -> None:
 
 def test_numbers_are_packed_as_exactly_as_a_plot_shows_them() -> None:
     """Single precision where it is enough, and gaps stay."""
-    assert packed(np.array([0.0, 0.25, np.nan]))["dtype"] == "f4"
-    assert np.isnan(numbers(packed(np.array([0.0, 0.25, np.nan])))[2])
-    tiny_changes = 1e9 + np.arange(3.0)
-    assert np.array_equal(numbers(packed(tiny_changes)), tiny_changes)
+    for values, kind in ((np.array([0.0, 0.25, np.nan]), "f4"), (1e9 + np.arange(3.0), "f8")):
+        array = packed(values)
+        assert array["dtype"] == kind
+        assert np.array_equal(numbers(array), values, equal_nan=True)
 
 
 def test_an_hour_of_signals_stays_small() -> None:
     """An hour at 10 Hz with thirty curves of limits."""
-    samples = 36_000
-    usage = results.design(samples=samples).usage[0]
-    many = tuple(
-        LimitUsage(kind="position", name=f"joint {i}", t=usage.t, share=usage.share)
-        for i in range(30)
-    )
-    design = results.design(samples=samples, usage=many)
-    html = report_of([design])
-    assert len(html) < MAX_SIZE
+    design = results.design(samples=36_000)
+    many = tuple(replace(design.usage[0], name=f"joint {i}") for i in range(30))
 
     # A large video leaves less room.
     video = replace(film("video/mp4"), data=bytes(2_000_000))
-    assert len(report_of([design], media=Media(video))) < MAX_SIZE
+    for media in (Media(), Media(video)):
+        assert len(report_of([replace(design, usage=many)], media=media)) < MAX_SIZE
 
 
 # ---- video
@@ -307,16 +298,8 @@ def test_a_report_has_the_name_of_its_experiment_wherever_it_is(tmp_path: Path) 
 
 
 def test_a_report_draws_every_length_of_segments_that_was_compared() -> None:
-    count, shape = 7, (7, len(results.PARAMETERS))
-    study = HorizonStudy(
-        lengths=np.geomspace(0.1, 6.4, count),
-        errors=np.ones((count, count)),
-        chosen=0,
-        is_whole=True,
-        parameters=results.PARAMETERS,
-        units=results.UNITS,
-        theta=np.ones(shape),
-        half_widths=np.full(shape, 0.1),
-        is_apart=np.zeros(shape, dtype=bool),
-    )
-    assert "whole recordings" in report_of([results.estimate(horizons=study)])
+    grown = results.horizons()
+    for study, is_flat in ((grown, False), (replace(grown, errors=np.ones((4, 4))), True)):
+        html = report_of([results.estimate(horizons=study)])
+        assert "whole recordings" in html
+        assert ("an effect that does not add up" in html.replace("\n", " ")) is is_flat

@@ -82,53 +82,46 @@ def test_the_files_follow_the_format(arm: Designed, tmp_path: Path) -> None:
     assert info["splits"] == {"train": "0:1"} and info["video_path"] is None
     joints = ["yaw", "shoulder", "elbow", "wrist"]
     features = info["features"]
-    assert (features["action"]["dtype"], features["action"]["shape"]) == ("float32", [4])
-    assert features["action"]["names"] == [f"{joint}.pos" for joint in joints]
-    states = [f"{joint}.{ending}" for ending in ("pos", "vel") for joint in joints]
-    assert features["observation.state"]["names"] == states
-
     data = table(tmp_path, "data/chunk-000/file-000.parquet")
-    types = {name: str(data.schema.field(name).type) for name in data.column_names}
-    assert {name: types[name] for name in DEFAULTS} == DEFAULTS
-    assert data.schema.field("action").type == pa.list_(pa.float32(), 4)
-    assert data.schema.field("observation.state").type == pa.list_(pa.float32(), 8)
     assert set(features) == set(data.column_names)
+    for feature, endings in (("action", ["pos"]), ("observation.state", ["pos", "vel"])):
+        stated, names = features[feature], [f"{j}.{e}" for e in endings for j in joints]
+        assert (stated["dtype"], stated["names"]) == ("float32", names)
+        assert stated["shape"] == [len(names)]
+        assert data.schema.field(feature).type == pa.list_(pa.float32(), len(names))
+    types = {name: str(data.schema.field(name).type) for name in DEFAULTS}
+    assert types == DEFAULTS
     assert data.column("timestamp").to_pylist()[-1] == 0.5
 
     stats = json.loads((tmp_path / "meta" / "stats.json").read_text(encoding="utf-8"))
     assert set(stats) == set(features)
     for feature, numbers in stats.items():
-        width = features[feature]["shape"][0]
         assert set(numbers) == STATISTICS
-        assert {len(value) for key, value in numbers.items() if key != "count"} == {width}
-        assert numbers["count"] == [51]
+        assert numbers.pop("count") == [51]
+        assert {len(value) for value in numbers.values()} == {features[feature]["shape"][0]}
 
     (episode,) = table(tmp_path, "meta/episodes/chunk-000/file-000.parquet").to_pylist()
     assert episode["tasks"] == ["mjfim design servo_arm"]
     assert (episode["dataset_from_index"], episode["dataset_to_index"]) == (0, 51)
     assert episode["stats/action/max"] == stats["action"]["max"]
-    places = {
-        f"{place}/{kind}_index" for place in ("data", "meta/episodes") for kind in ("chunk", "file")
-    }
-    assert {key for key in episode if key.startswith(("data/", "meta/"))} == places
+    for place in ("data", "meta/episodes"):
+        assert {f"{place}/chunk_index", f"{place}/file_index"} <= set(episode)
 
     # pandas makes the texts the index of the table of tasks.
     tasks = table(tmp_path, "meta/tasks.parquet")
-    metadata = json.loads(tasks.schema.metadata[b"pandas"])
-    (index,) = metadata["index_columns"]
+    (index,) = json.loads(tasks.schema.metadata[b"pandas"])["index_columns"]
     assert tasks.to_pydict() == {"task_index": [0], index: ["mjfim design servo_arm"]}
 
 
-@pytest.mark.parametrize("unit", ["rad", "deg"])
-def test_actions_are_the_controls_in_the_unit(unit: str, arm: Designed, tmp_path: Path) -> None:
-    mjfim.export_design(*arm, tmp_path, to="lerobot", unit=unit)
+def test_actions_are_the_controls_in_the_unit(arm: Designed, tmp_path: Path) -> None:
+    mjfim.export_design(*arm, tmp_path, to="lerobot", unit="deg")
     data = table(tmp_path, "data/chunk-000/file-000.parquet")
-    curve, factor = arm[1].trajectory, 180.0 / np.pi if unit == "deg" else 1.0
+    curve = arm[1].trajectory
     actions = np.array(data.column("action").to_pylist())
     states = np.array(data.column("observation.state").to_pylist())
-    assert_allclose(actions[:-1], factor * curve.ctrl, rtol=1e-6, atol=1e-6)
+    assert_allclose(actions[:-1], np.degrees(curve.ctrl), rtol=1e-6, atol=1e-6)
     assert_array_equal(actions[-1], actions[-2])
-    wanted = factor * np.concatenate([curve.qpos, curve.qvel], axis=1)
+    wanted = np.degrees(np.concatenate([curve.qpos, curve.qvel], axis=1))
     assert_allclose(states, wanted, rtol=1e-6, atol=1e-5)
 
 
@@ -144,7 +137,7 @@ def test_the_dataset_is_read_as_a_recording(cart: Designed, tmp_path: Path) -> N
 
 
 def test_the_verb_replaces_its_own_dataset(cart: Designed, tmp_path: Path) -> None:
-    """Twice into one folder; a file of the user and a wrong unit are refused."""
+    """Twice into one folder; a file of the user is refused."""
     cart[1].save(tmp_path / "design")
     words = ("export", tmp_path / "design", "--experiment", CART, "--to", "lerobot")
     for _ in range(2):
@@ -153,7 +146,6 @@ def test_the_verb_replaces_its_own_dataset(cart: Designed, tmp_path: Path) -> No
 
     (tmp_path / "set" / "meta" / "info.json").write_text("{}", encoding="utf-8")
     misused(run(*words, "-o", tmp_path / "set"), "info.json", "--force")
-    misused(run(*words, "-o", tmp_path / "set2", "--unit", "turn"), "--unit: unknown unit 'turn'")
 
 
 def test_a_rate_that_is_no_whole_number_is_refused(cart: Designed, tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from types import ModuleType, SimpleNamespace
+from types import SimpleNamespace
 from typing import Any
 from unittest.mock import Mock
 
@@ -70,7 +70,7 @@ def script(cart: Designed, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def imported(path: Path) -> ModuleType:
+def imported(path: Path) -> Any:
     """A module by its path, as a user imports it."""
     spec = importlib.util.spec_from_file_location("exported_player", path)
     assert spec is not None and spec.loader is not None
@@ -80,13 +80,13 @@ def imported(path: Path) -> ModuleType:
 
 
 @pytest.fixture
-def player(script: Path) -> ModuleType:
+def player(script: Path) -> Any:
     return imported(script)
 
 
-def played(player: ModuleType, robot: SimulatedRobot, path: Path, **options: Any) -> str:
+def played(player: Any, robot: SimulatedRobot, path: Path, **options: Any) -> str:
     """Play on a simulated robot, in its own time."""
-    player.time = SimpleNamespace(perf_counter=lambda: robot.data.time, sleep=robot.sleep)  # type: ignore[attr-defined]
+    player.time = SimpleNamespace(perf_counter=lambda: robot.data.time, sleep=robot.sleep)
     return str(player.play(robot, str(path), **options))
 
 
@@ -94,7 +94,7 @@ def played(player: ModuleType, robot: SimulatedRobot, path: Path, **options: Any
 @pytest.mark.slow
 def test_parameters_are_identified_from_what_the_player_records(
     feedback: bool,
-    player: ModuleType,
+    player: Any,
     cart: Designed,
     tmp_path: Path,
 ) -> None:
@@ -116,12 +116,12 @@ def test_parameters_are_identified_from_what_the_player_records(
 
 
 def test_feedback_is_the_gain_times_the_deviation_within_limits(
-    player: ModuleType, cart: Designed, tmp_path: Path
+    player: Any, cart: Designed, tmp_path: Path
 ) -> None:
     """Each control is that of a loop of its own; those beyond the limits are clipped."""
     robot = SimulatedRobot()
     robot.data.qpos[:] += [0.3, -0.1]
-    player.START_TOLERANCE = np.inf  # type: ignore[attr-defined]
+    player.START_TOLERANCE = np.inf
     log = tmp_path / "recording.csv"
     said = played(player, robot, log, feedback=True)
     found, planned = read_table(log), cart[1].trajectory.state
@@ -136,7 +136,7 @@ def test_feedback_is_the_gain_times_the_deviation_within_limits(
     assert np.isnan(sent[-1]) and len(found["t"]) == 401
 
 
-def test_what_is_not_measured_has_no_feedback(player: ModuleType, tmp_path: Path) -> None:
+def test_what_is_not_measured_has_no_feedback(player: Any, tmp_path: Path) -> None:
     planned = player.X[5]
     some = player.deviation(planned, {"qpos:hinge": planned[1] - 0.1, "qvel:slide": float("nan")})
     assert_allclose(some, [0.0, 0.1, 0.0, 0.0], atol=1e-15)
@@ -166,13 +166,13 @@ def test_rotations_are_subtracted_as_mujoco_does(tmp_path: Path) -> None:
 @pytest.mark.parametrize("error", [KeyboardInterrupt, OSError])
 @pytest.mark.parametrize("has_stop", [False, True])
 def test_an_early_end_makes_the_robot_safe_and_keeps_the_recording(
-    error: type[BaseException], has_stop: bool, player: ModuleType, tmp_path: Path
+    error: type[BaseException], has_stop: bool, player: Any, tmp_path: Path
 ) -> None:
     """After Ctrl-C or an error, `stop` is called, or motors get 0."""
     robot, stopped = SimulatedRobot(), []
     robot.before_row[21] = Mock(side_effect=error)
     if has_stop:
-        robot.stop = lambda: stopped.append(len(robot.sent))  # type: ignore[attr-defined]
+        robot.stop = lambda: stopped.append(len(robot.sent))
     with pytest.raises(error):
         played(player, robot, tmp_path / "recording.csv")
     assert stopped == ([20] if has_stop else [])
@@ -182,7 +182,7 @@ def test_an_early_end_makes_the_robot_safe_and_keeps_the_recording(
 
 
 def test_a_late_computer_leaves_rows_out_and_keeps_the_time(
-    player: ModuleType, cart: Designed, tmp_path: Path
+    player: Any, cart: Designed, tmp_path: Path
 ) -> None:
     """After a pause of 30 ms the next row is that of the clock; the motion ends on time."""
     robot = SimulatedRobot()
@@ -195,7 +195,7 @@ def test_a_late_computer_leaves_rows_out_and_keeps_the_time(
     assert found["t"][-1] == pytest.approx(4.0, abs=1e-9)
 
 
-def test_nothing_is_sent_far_from_the_start(player: ModuleType, tmp_path: Path) -> None:
+def test_nothing_is_sent_far_from_the_start(player: Any, tmp_path: Path) -> None:
     robot = SimulatedRobot()
     robot.data.qpos[1] = 0.0
     with pytest.raises(ValueError, match=r"qpos:hinge is 0, but the design begins at 3\.14"):

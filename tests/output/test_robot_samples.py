@@ -26,31 +26,6 @@ from tests.identification.test_parameter_draws import COVARIANCE, estimated
 from tests.output.test_mjcf import compiled
 from tests.support.cart_pendulum import cart_pendulum
 
-# A robot of which one link stands in an included file, and one in a URDF.
-MAIN = """
-<mujoco>
-  <asset><model name="arm" file="arm.urdf"/></asset>
-  <worldbody><include file="link.xml"/><attach model="arm" prefix="x_"/></worldbody>
-  <actuator><motor name="drive" joint="hinge"/></actuator>
-</mujoco>
-"""
-LINK = """
-<mujocoinclude>
-  <body name="link">
-    <joint name="hinge" axis="0 1 0" damping="0.1"/>
-    <inertial pos="0 0 -0.3" mass="1" diaginertia="0.01 0.01 0.001"/>
-  </body>
-</mujocoinclude>
-"""
-ARM = """<robot name="arm">
-  <link name="base"/>
-  <link name="upper">
-    <inertial><mass value="2"/><inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial>
-  </link>
-  <joint name="shoulder" type="continuous"><parent link="base"/><child link="upper"/></joint>
-</robot>
-"""
-
 
 def drawn(system: System, covariance: Any, count: int) -> Estimate:
     """An estimate with draws."""
@@ -64,26 +39,10 @@ def system() -> System:
     return System.resolve(cart_pendulum())
 
 
-def included_system(folder: Path) -> System:
-    """The system of a robot of an included file and a URDF."""
-    for name, text in {"main.xml": MAIN, "link.xml": LINK, "arm.urdf": ARM}.items():
-        (folder / name).write_text(text, encoding="utf-8")
-    parameters = {"mass": "body/link:mass", "other": "body/x_upper:mass"}
-    tables: dict[str, Any] = {"rate": 100.0, "noise": {"state": 0.01}, "parameters": parameters}
-    return System.resolve(mjfim.Experiment(model="main.xml", directory=folder, **tables))
-
-
-@pytest.mark.parametrize("is_included", [False, True])
-def test_every_model_is_the_one_in_memory(
-    is_included: bool, system: System, tmp_path: Path
-) -> None:
-    """Also where links stand in an included file and in a URDF."""
-    if is_included:
-        system = included_system(tmp_path)
-    count = len(system.parameters)
-    estimate = drawn(system, np.diag([1e-4] * count) if is_included else COVARIANCE, 5)
+def test_every_model_is_the_one_in_memory(system: System, tmp_path: Path) -> None:
+    estimate, out = drawn(system, COVARIANCE, 5), tmp_path / "out"
     assert estimate.draws is not None
-    values, out = estimate.draws.values, tmp_path / "out"
+    values = estimate.draws.values
     assert write_samples(out, estimate, system) == []
     found = {path.relative_to(out).as_posix() for path in out.rglob("*.*")}
     assert found == {*sample_files(out)}
@@ -93,12 +52,12 @@ def test_every_model_is_the_one_in_memory(
         theta = np.array(estimate.theta)
         theta[~system.parameters.initial_deviations] = values[i]
         assert same_dynamics(written, system.model_at(theta, at_keyframe=False))
-        assert written.body("link" if is_included else "bob").mass[0] == values[i, 0]
+        assert written.body("bob").mass[0] == values[i, 0]
 
     # The table holds all digits.
     with (out / "samples.csv").open(encoding="utf-8", newline="") as stream:
         header, *rows = csv.reader(stream)
-    assert header[:2] == ["robot", "mass [kg]" if is_included else "m [kg]"]
+    assert header[:2] == ["robot", "m [kg]"]
     table = np.array([[float(cell) for cell in row] for row in rows])
     assert_array_equal(table, np.column_stack([np.arange(1.0, 6.0), values]))
 

@@ -204,17 +204,6 @@ def test_an_mjcf_attaches_the_identified_urdf(tmp_path: Path, prefix: str) -> No
     assert_allclose(motion(alone), motion(wanted), rtol=1e-8, atol=1e-10)
 
 
-def test_values_that_a_urdf_cannot_hold_are_named(tmp_path: Path) -> None:
-    further = {
-        "rotor": {"target": "joint/elbow:armature", "scale": 0.01},
-        "drag": {"target": "joint/elbow:damping[1]", "scale": 0.01},
-    }
-    system = system_of(tmp_path, **further)
-    assert written(tmp_path / "out", system, other_values(system)) == [
-        "identified.urdf: a URDF cannot hold rotor, drag; identified.xml has all values",
-    ]
-
-
 def test_a_urdf_that_is_attached_twice_is_not_written(tmp_path: Path) -> None:
     """The MJCF, which MuJoCo prints, holds the values of the first one."""
     system_of(tmp_path)

@@ -111,19 +111,16 @@ class TestFilm:
         """The least safe and the safest one; a robot that leaves a limit has its own word."""
         system = System.resolve(mjfim.Experiment.from_file(MODELS / "cart_pendulum.toml"))
         t = np.linspace(0.0, 4.0, 101)
-        moves = np.stack([a * np.sin(np.stack([t, 2.0 * t], axis=1)) for a in (1.0, 1.2, 0.9, 1.1)])
-        kept = results.rehearsal()
-        margins = kept.margins.copy()
-        margins[3] = -0.1
+        moves = np.multiply.outer([1.0, 1.2, 0.9, 1.1], np.sin(np.column_stack([t, 2.0 * t])))
         motions = RobotMotions(robots=(3, 1, 2), t=t, qpos=moves[1:])
+        safe = results.rehearsal(motions=motions)
+        margins = safe.margins.copy()
+        margins[3] = -0.1
         designed = replace(results.evaluation(0.1, 50), trajectory=motion(t, moves[0]))
-        design = results.design(
-            initial=designed,
-            final=designed,
-            rehearsal=replace(kept, margins=margins, motions=motions),
-        )
-        film = film_of(system, design)
-        left, right = film.views
+        design = results.design(initial=designed, final=designed, rehearsal=safe)
+        left, right = film_of(
+            system, replace(design, rehearsal=replace(safe, margins=margins))
+        ).views
         assert [track.term for track in left.tracks] == ["initial"]
         assert [track.term for track in right.tracks] == ["designed", "unsafe", "rehearsed"]
         assert [track.is_ghost for track in right.tracks] == [False, True, True]
@@ -131,13 +128,14 @@ class TestFilm:
             assert_allclose(track.qpos, qpos, atol=1e-12)
 
         # Two safe robots are named once.
-        safe = film_of(system, replace(design, rehearsal=replace(kept, motions=motions)))
-        assert len(safe.views[1].tracks) == 3 and safe.caption.count("rehearsed") == 1
+        film = film_of(system, design)
+        assert len(film.views[1].tracks) == 3 and film.caption.count("rehearsed") == 1
 
     def test_positions_between_samples_turn_the_shortest_way(self, flying: mujoco.MjModel) -> None:
-        begin = np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
-        middle = np.array([0.5, 0.0, 0.0, np.cos(0.3), 0.0, 0.0, np.sin(0.3)])
-        end = np.array([1.0, 0.0, 0.0, np.cos(0.6), 0.0, 0.0, np.sin(0.6)])
+        begin, middle, end = (
+            np.array([x, 0.0, 0.0, np.cos(0.6 * x), 0.0, 0.0, np.sin(0.6 * x)])
+            for x in (0.0, 0.5, 1.0)
+        )
 
         # The other sign of the quaternion is the same rotation.
         rows = np.stack([begin, [1.0, 1.0, 1.0, -1.0, 1.0, 1.0, -1.0] * end])
@@ -166,11 +164,10 @@ class TestFilm:
         self, axis: str, size: tuple[int, int]
     ) -> None:
         """A rod that turns in the horizontal plane is wide, one in an upright plane is square."""
-        text = SWING.replace('axis="0 1 0"', f'axis="{axis}"').replace("0 0 -1", "0.8 0 -0.1")
+        text = SWING.replace("0 1 0", axis).replace("0 0 -1", "0.8 0 -0.1")
         t = np.linspace(0.0, 4.0, 81)
-        turning = motion(t, 2.0 * np.pi * t[:, None] / t[-1])
-        film = identified(mujoco.MjModel.from_xml_string(text), turning)
-        assert film.camera.size == size
+        turning = motion(t, 0.5 * np.pi * t[:, None])
+        assert identified(mujoco.MjModel.from_xml_string(text), turning).camera.size == size
 
 
 class TestVideo:

@@ -6,10 +6,10 @@ from __future__ import annotations
 
 import dataclasses
 import io
+import itertools
 import json
 import shutil
 import zipfile
-from collections.abc import Callable
 from dataclasses import replace
 from enum import Enum
 from pathlib import Path
@@ -23,32 +23,14 @@ from mjfim import files
 from mjfim.errors import RecordingError
 from mjfim.files import as_json
 from mjfim.records.base import RECORD, SavedRecord
-from mjfim.records.campaign import Campaign
-from mjfim.records.check import Check
 from mjfim.records.design import Design, Evaluation
 from mjfim.records.estimate import Estimate, PredictionErrors
-from mjfim.records.rehearsal import Rehearsal
-from mjfim.records.robots import RobotComparison
-from mjfim.records.studies import Comparison, MonteCarloStudy
 from mjfim.records.trajectory import Recording, Trajectory
-from mjfim.records.worth import Worth
 from tests.support import results
 
-SAVED: tuple[type[SavedRecord], ...] = (
-    Campaign,
-    Check,
-    Comparison,
-    Design,
-    Estimate,
-    Evaluation,
-    MonteCarloStudy,
-    PredictionErrors,
-    Recording,
-    Rehearsal,
-    RobotComparison,
-    Trajectory,
-    Worth,
-)
+# The results of the verbs, and parts of them that have files of their own.
+SAVED: list[type[SavedRecord]] = [type(make()) for make in results.MAKERS.values()]
+SAVED += [Evaluation, PredictionErrors, Recording, Trajectory]
 
 
 def saved_fields(record: Any) -> list[str]:
@@ -97,48 +79,35 @@ TEXTS = (
 )
 
 
-class AwkwardValues:
-    """Builds a value of any type that records have, from numbers and texts that are easily lost."""
+def awkward(kind: type[SavedRecord], count: int, is_optional_given: bool) -> SavedRecord:
+    """A record of numbers and texts that are easily lost.
 
-    def __init__(self, count: int, optional: bool) -> None:
-        """Build tuples, dictionaries and arrays with `count` entries; optional values are present
-        or None.
-        """
-        self.count, self.optional, self._turn = count, optional, 0
+    Its tuples, dictionaries and arrays have `count` entries.
+    """
+    turn = itertools.count(1)
 
-    def next_of(self, values: Any) -> Any:
-        """Return the values in turn."""
-        self._turn += 1
-        return values[self._turn % len(values)]
+    def next_of(values: Any) -> Any:
+        return values[next(turn) % len(values)]
 
-    def build(self, hint: Any) -> Any:
-        """Return a value of a type."""
-        origin = get_origin(hint)
+    def build(hint: Any) -> Any:
+        origin, entries = get_origin(hint), get_args(hint)
         if origin in (Union, UnionType):
-            inner = next(entry for entry in get_args(hint) if entry is not NoneType)
-            is_given = self.optional or NoneType not in get_args(hint)
-            return self.build(inner) if is_given else None
+            inner = next(entry for entry in entries if entry is not NoneType)
+            return build(inner) if is_optional_given or NoneType not in entries else None
         if origin is np.ndarray:
-            shape = (self.count, self.next_of((1, 2, 3)))
-            return np.resize(NUMBERS, shape)
+            return np.resize(NUMBERS, (count, next_of((1, 2, 3))))
         if origin is tuple:
-            entries = get_args(hint)
-            if entries[-1] is Ellipsis:
-                entries = entries[:1] * self.count
-            return tuple(self.build(entry) for entry in entries)
+            return tuple(map(build, entries[:1] * count if entries[-1] is Ellipsis else entries))
         if origin is dict:
-            return {
-                f"{text}{i}": self.build(get_args(hint)[1])
-                for i, text in enumerate(TEXTS[: self.count])
-            }
+            return {f"{text}{i}": build(entries[1]) for i, text in enumerate(TEXTS[:count])}
         if dataclasses.is_dataclass(hint):
             hints = get_type_hints(hint)
-            return hint(**{name: self.build(hints[name]) for name in saved_fields(hint)})
-        if issubclass(hint, Enum):
-            return self.next_of(list(hint))
-        return self.next_of(
-            {bool: (True, False), int: (0, 7, 2**60), float: NUMBERS, str: TEXTS}[hint]
-        )
+            return hint(**{name: build(hints[name]) for name in saved_fields(hint)})
+        plain = {bool: (True, False), int: (0, 7, 2**60), float: NUMBERS, str: TEXTS}
+        return next_of(list(hint) if issubclass(hint, Enum) else plain[hint])
+
+    made: SavedRecord = build(kind)
+    return made
 
 
 @pytest.mark.parametrize("kind", SAVED, ids=lambda kind: kind.__name__)
@@ -149,7 +118,7 @@ def test_awkward_values_survive(
     """Infinity, NaN, negative zero, empty tuples, names with quotes and dots, and every optional
     field.
     """
-    record = AwkwardValues(count, optional).build(kind)
+    record = awkward(kind, count, optional)
     record.save_archive(tmp_path / "new" / "folder")
     assert_same(kind.load(tmp_path / "new" / "folder"), record)
 
@@ -207,76 +176,57 @@ def saved(tmp_path: Path) -> Path:
     return tmp_path / "saved"
 
 
-def rewritten(path: Path, change: Callable[[dict[str, np.ndarray]], object]) -> None:
-    """Change the arrays of an npz file."""
+def replaced(path: Path, name: str, value: Any) -> None:
+    """Replace an array or a plain value of an npz file, or take it away where it is None."""
     with np.load(path, allow_pickle=False) as archived:
-        arrays = {name: archived[name] for name in archived.files}
-    change(arrays)
-    np.savez(path, **arrays)
-
-
-def with_content(path: Path, change: Callable[[dict[str, Any]], object]) -> None:
-    """Change the record's plain values in an npz file."""
-
-    def apply(arrays: dict[str, np.ndarray]) -> None:
-        content = json.loads(str(arrays[RECORD]))
-        change(content)
+        arrays = dict(archived)
+    content = json.loads(str(arrays[RECORD]))
+    fields = content["fields"]
+    place = next((each for each in (arrays, content) if name in each), fields)
+    place.pop(name, None)
+    if value is not None:
+        place[name] = value
+    if place is not arrays:
         arrays[RECORD] = np.array(json.dumps(content))
-
-    rewritten(path, apply)
+    np.savez(path, **arrays)
 
 
 AGAIN = r"write it again with `mjfim design EXPERIMENT -o DIR`"
 OTHER = rf"design\.npz: the array 'record' is missing or of another version .*{AGAIN}"
 
-# Arrays that are replaced, or taken away, and what is said.
-FAULTY_ARRAYS: dict[str, tuple[str, np.ndarray | None, str]] = {
-    "an older version": (RECORD, None, OTHER),
-    "another text": (RECORD, np.array("hello"), OTHER),
-    "another list": (RECORD, np.array("[1]"), OTHER),
-    "a missing array": (
+# Arrays and plain values that are replaced, or taken away, and what is said.
+FAULTS = [
+    (RECORD, None, OTHER),
+    (RECORD, np.array("hello"), OTHER),
+    (RECORD, np.array("[1]"), OTHER),
+    (
         "initial_qpos",
         None,
         rf"'initial\.trajectory\.qpos': .*the array 'initial_qpos' is missing; {AGAIN}",
     ),
-    "an array of texts": ("theta", np.array(["a"]), r"the array 'theta' does not hold numbers"),
-}
-
-# Plain values, of the record or of its fields, and what is said.
-FAULTY_VALUES: dict[str, tuple[object, str]] = {
-    "version": (99, rf"design\.npz: has version 99, not 3; {AGAIN}"),
-    "type": ("Check", r"design\.npz: holds a record of type Check, not Design"),
-    "colour": ("red", r"the field 'colour': Unexpected keyword"),
-    "status": ("BORED", r"the field 'status': Input should be .*converged"),
-    "slope": ("steep", r"the field 'slope': Input should be a valid number"),
-    "parameters": ([1], r"the field 'parameters\.0': Input should be a valid string"),
-    "steps": (True, r"the field 'steps': Input should be a valid integer"),
-    "final": ({}, r"the field 'final\.trajectory': Field required"),
-}
+    ("theta", np.array(["a"]), r"the array 'theta' does not hold numbers"),
+    ("version", 99, rf"design\.npz: has version 99, not 3; {AGAIN}"),
+    ("type", "Check", r"design\.npz: holds a record of type Check, not Design"),
+    ("colour", "red", r"the field 'colour': Unexpected keyword"),
+    ("status", "BORED", r"the field 'status': Input should be .*converged"),
+    ("slope", "steep", r"the field 'slope': Input should be a valid number"),
+    ("parameters", [1], r"the field 'parameters\.0': Input should be a valid string"),
+    ("steps", True, r"the field 'steps': Input should be a valid integer"),
+    ("final", {}, r"the field 'final\.trajectory': Field required"),
+]
 
 
-@pytest.mark.parametrize("name", [*FAULTY_ARRAYS, *FAULTY_VALUES])
-def test_damaged_files_are_described(name: str, saved: Path) -> None:
+@pytest.mark.parametrize(("name", "value", "message"), FAULTS)
+def test_damaged_files_are_described(name: str, value: Any, message: str, saved: Path) -> None:
     """The file, what is wrong, and how to write it again."""
-    if name in FAULTY_ARRAYS:
-        key, array, message = FAULTY_ARRAYS[name]
-        replaced = {} if array is None else {key: array}
-        rewritten(saved / "design.npz", lambda arrays: (arrays.pop(key), arrays.update(replaced)))
-    else:
-        value, message = FAULTY_VALUES[name]
-        with_content(
-            saved / "design.npz",
-            lambda content: (content if name in content else content["fields"]).update(
-                {name: value}
-            ),
-        )
+    replaced(saved / "design.npz", name, value)
     with pytest.raises(RecordingError, match=message):
         Design.load(saved)
 
 
 def test_fields_with_a_default_may_be_missing(saved: Path) -> None:
     """A later version can add a field."""
-    with_content(saved / "design.npz", lambda content: content["fields"].pop("found_by"))
+    replaced(saved / "design.npz", "found_by", None)
     assert_same(Design.load(saved), results.design(found_by="initial control"))
 
 

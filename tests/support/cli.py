@@ -75,11 +75,12 @@ def run(*words: object, answers: str | None = None) -> Result:
     """Run `mjfim` with these words in this process.
 
     Args:
-        *words: The words.
+        *words: The words; the first one may be several, with blanks between them.
         answers: Standard input.
     """
+    split = [*" ".join(map(str, words[:1])).split(), *map(str, words[1:])]
     with patch.object(typer.testing, "_get_command", command_of):
-        return CliRunner().invoke(cli.app, [str(word) for word in words], input=answers)
+        return CliRunner().invoke(cli.app, split, input=answers)
 
 
 def done(*words: object, code: int = 0) -> Result:

@@ -17,11 +17,13 @@ from mjfim.records.design import (
 )
 from mjfim.records.estimate import (
     Estimate,
+    HorizonStudy,
     ParameterDraws,
     Prediction,
     PredictionErrors,
     Whiteness,
 )
+from mjfim.records.estimate_parts import InformationInTime, ResidualForce
 from mjfim.records.rehearsal import (
     Fan,
     FiniteSteps,
@@ -215,6 +217,51 @@ def draws(std: Array) -> ParameterDraws:
         std=std,
         replaced=2,
         seed=0,
+    )
+
+
+def horizons(
+    theta: Array = THETA,
+    parameters: tuple[str, ...] = PARAMETERS,
+    units: tuple[str, ...] = UNITS,
+) -> HorizonStudy:
+    """Four lengths of segments, on which some parameters depend."""
+    found = np.outer([1.2, 1.1, 1.0, 0.9], theta)
+    apart = np.zeros(found.shape, dtype=bool)
+    apart[0, ::2] = True
+    return HorizonStudy(
+        lengths=np.array([0.12, 0.48, 1.9, 4.0]),
+        errors=np.array([1.1, 1.2, 1.8, 5.0]) * np.ones((4, 1)),
+        chosen=2,
+        is_whole=True,
+        parameters=parameters,
+        units=units,
+        theta=found,
+        half_widths=0.05 * found,
+        is_apart=apart,
+    )
+
+
+def residual_forces(*joints: str) -> tuple[ResidualForce, ...]:
+    """Residual forces of joints."""
+    speed = np.sin(np.linspace(0.0, 40.0, 300))
+    force = np.sign(speed) + 0.1 * np.random.default_rng(1).normal(size=300)
+    curves = {"position": np.cumsum(speed), "speed": speed, "force": force}
+    return tuple(
+        ResidualForce(joint=joint, unit="N m", sigma=0.1, size=2.0, **curves) for joint in joints
+    )
+
+
+def information_in_time(parameters: tuple[str, ...], end: float) -> InformationInTime:
+    """Information of ten blocks of the recording, up to an end [s]."""
+    edges, shape = np.linspace(0.0, end, 11), (10, len(parameters))
+    return InformationInTime(
+        parameters=parameters,
+        recording=np.zeros(10),
+        times=np.column_stack([edges[:-1], edges[1:]]),
+        shares=np.full(shape, 0.09),
+        pulls=np.resize([-2.0, 2.0], shape),
+        scatter=1.0,
     )
 
 
