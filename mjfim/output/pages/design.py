@@ -710,7 +710,8 @@ def _check_verdict(check: Check) -> Verdict:
         worst = max(shares, key=lambda name: shares[name])
         sigma = relative(shares[worst], 1.0)
         if NORMAL_95 * shares[worst] >= UNDETERMINED_SHARE:
-            text = f"{check.source} does not determine {worst}: its σ is {sigma} of its size."
+            does = "do" if check.source.endswith("recordings") else "does"
+            text = f"{check.source} {does} not determine {worst}: its σ is {sigma} of its size."
             return Verdict(text, Level.DOUBTFUL, ok=True)
         text = (
             f"All parameters can be identified with {check.source}; the least accurate is {worst} "
