@@ -103,7 +103,7 @@ def design(
         )
     code = run.finish(result, system, design=run.output, further=further, remarks=remarks)
     write_wanted_video(video, system, result)
-    raise typer.Exit(code or (found is not None and not found.closed))
+    raise typer.Exit(code or int(found is not None and not found.closed))
 
 
 def _cores(task: DesignTask) -> int:

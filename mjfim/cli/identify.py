@@ -131,7 +131,7 @@ def identify(
     remarks = [f"warning: --samples: no robots were drawn{not_drawn}"] if not_drawn else []
     code = run.finish(result, system, sections=sections, remarks=remarks)
     write_wanted_video(video, system, result)
-    raise typer.Exit(code or bool(not_drawn))
+    raise typer.Exit(code or int(bool(not_drawn)))
 
 
 def _with_draws(result: Estimate, system: System, count: int, seed: int) -> tuple[Estimate, str]:

@@ -63,4 +63,4 @@ def montecarlo(
     if not is_complete:
         parts = ", ".join(f"{count} of {trials} trials of {name}" for name, count in done.items())
         say_from_program(f"interrupted; only {parts} are finished")
-    raise typer.Exit(code or not is_complete)
+    raise typer.Exit(code or int(not is_complete))
