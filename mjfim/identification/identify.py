@@ -361,9 +361,21 @@ def _with_lost_held(search: FitSearch, fit: FitResult) -> FitResult:
 
     The speed of a Stribeck friction, for example, has no effect where the friction vanishes.
     """
-    if np.isfinite(standard_deviations(fit.solution.condensed.information())).all():
+    information = fit.solution.condensed.information()
+    if np.isfinite(standard_deviations(information)).all():
         return fit
     lost = _unseen_directions(search.task, fit.problem, fit.theta)
+    if not lost.count:
+        # Longer differences may show an effect, such as that of a limit which is hardly reached.
+        columns = np.flatnonzero(np.diag(information) == 0.0)
+        silent = np.unique(fit.problem.parameter_of_column[columns])
+        axes = np.eye(len(fit.theta))
+        lost = NullSpace(
+            directions=np.concatenate([fit.null_space.directions, axes[:, silent]], axis=1),
+            silent=(*fit.null_space.silent, *silent.tolist()),
+            basis=np.delete(axes, silent, axis=1),
+            smallest=0.0,
+        )
     if not lost.count:
         return fit
     held = fit.problem.pinned(fit.theta, lost)

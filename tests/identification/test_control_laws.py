@@ -91,6 +91,29 @@ def test_plant_gains_and_latency_are_found_from_references_and_feedforward() -> 
     assert found.summary()["controllers"][0]["numbers"]["kp"] == found.theta[2]
 
 
+def test_a_limit_that_the_law_hardly_reaches_leaves_the_others_determined(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """It clips the control at the guess, and at the estimate only after a long difference."""
+    monkeypatch.setattr("mjfim.identification.fit_problem.SENSITIVITY_STEP", 0.1)
+    ends = [
+        {"path": f"controller/shoulder:saturation[{i}]", "scale": 2.0 * i - 1.0} for i in (0, 1)
+    ]
+    limit = {"targets": ends, "guess": 3.0, "bounds": [1.0, 60.0], "scale": 30.0, "true": 40.0}
+    experiment = arm_experiment(
+        {"shoulder": SHOULDER, "elbow": ELBOW},
+        parameters={**PLANT, "limit": limit},
+        noise=NOISE,
+        fit={"bootstrap": 0, "segments": "whole"},
+    )
+    found = mjfim.identify(experiment, [log_of(experiment, 400, 2)], progress=False)
+    assert np.isinf(found.std[2])
+    true = System.resolve(experiment).parameters.true
+    assert (np.abs(found.theta - true)[:2] < 4.0 * found.std[:2]).all()
+    assert (found.std[:2] < 0.01 * true[:2]).all()
+    assert any("not identifiable separately: limit" in sentence for sentence in found.warnings)
+
+
 def test_derivatives_agree_with_differences_of_a_plain_loop() -> None:
     """By gains and all times of the law, of a simulation and of a fit."""
     numbers = {
