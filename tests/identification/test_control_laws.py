@@ -271,24 +271,6 @@ def test_the_equation_of_motion_needs_the_torque_of_every_law(tmp_path: Path) ->
         mjfim.inverse_dynamics(experiment, [log, without])
 
 
-def test_estimates_reach_the_bound() -> None:
-    """Repetitions with whole recordings."""
-    experiment = arm_experiment(
-        {"shoulder": SHOULDER, "elbow": ELBOW}, parameters={**PLANT, **GAINS}, noise=NOISE
-    )
-    system = System.resolve(experiment)
-    trajectory = system.plant.simulate(system.parameters.true, references(400, 11))
-    study = mjfim.monte_carlo(experiment, trajectory, trials=20, seed=1, progress=False)
-
-    found = study.sets["final"]
-    assert found.failed == 0
-    spread = np.sqrt(np.diag(found.covariance) / found.trials)
-    assert np.abs((found.mean - system.parameters.true) / spread).max() < 4.0
-    # The quantiles 2e-4 and 0.996 of the efficiency of 20 normal estimates.
-    assert (found.efficiency > 0.39).all()
-    assert (found.efficiency < 2.87).all()
-
-
 def test_intervals_of_a_fit_over_segments_with_a_motor_that_lags() -> None:
     """No log shows what a law commands, so that the state of the lag is free in every segment."""
     lag = {"target": "term/lag:time_constant", "true": 0.02, "guess": 0.01}
