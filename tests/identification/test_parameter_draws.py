@@ -56,16 +56,6 @@ def system() -> System:
     return System.resolve(cart_pendulum())
 
 
-def test_wide_intervals_stretch_the_covariance_of_earlier_versions(system: System) -> None:
-    """The intervals are twice and three times as wide as the formal ones."""
-    factor = np.array([2.0, 3.0, 1.0])
-    theta = system.parameters.guess
-    half = 1.959964 * factor * STD
-    estimate = estimated(system, COVARIANCE, interval=np.column_stack([theta - half, theta + half]))
-    found = honest_covariance(system.parameters, estimate)
-    assert_allclose(found, COVARIANCE * np.outer(factor, factor), rtol=1e-5)
-
-
 def test_a_seed_gives_the_same_robots(system: System) -> None:
     estimate = estimated(system, COVARIANCE)
     draws = draw_parameters(cart_pendulum(), estimate, 3, np.random.default_rng(0))
