@@ -90,16 +90,6 @@ def test_a_wrong_start_finds_the_truth_over_many_swings(
         assert "fell from" in found.summary()["restart"]["words"]
 
 
-def test_a_right_first_fit_is_not_repeated(tmp_path: Path) -> None:
-    system = pendulum(tmp_path, 4.0)
-    phases = set()
-    found = identify_system(
-        system, [swings(system, 4.0)], callback=lambda event: phases.add(event.phase)
-    )
-    require_found(found, system.parameters.true)
-    assert found.restart is None and phases == {"all data"}
-
-
 @pytest.mark.slow
 def test_deviations_of_the_initial_state_and_biases_are_continued_too(tmp_path: Path) -> None:
     """Parameters of the initial state are no unknowns of segments, the others are."""
