@@ -54,14 +54,6 @@ def log_with(friction: float, count: int) -> list[Recording]:
 
 
 @pytest.mark.slow
-def test_nothing_is_compared_where_the_model_explains_the_recordings() -> None:
-    found = mjfim.identify(stated(), logs_of(stated(), 0, 1))
-    assert not found.misfit and found.missing_terms == ()
-    assert found.horizons is None
-    assert all(len(begins) == 1 for begins in found.segments)
-
-
-@pytest.mark.slow
 def test_lengths_are_compared_where_the_model_lacks_a_term(tmp_path: Path) -> None:
     logs = log_with(0.6, 2)
     found = mjfim.identify(stated(), logs)
