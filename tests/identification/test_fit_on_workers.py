@@ -15,7 +15,6 @@ import mjfim
 from mjfim.experiment.system import System
 from mjfim.identification import (
     left_out,
-    search,
     segment_simulation,
 )
 from mjfim.identification.fit_problem import FitProblem
@@ -117,25 +116,6 @@ class StoppingThreads(ThreadPoolExecutor):
         if self._left == 0:
             self._stop.request()
         return super().submit(fn, *args, **kwargs)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("after", [1, 21, 60, 100])
-def test_a_request_to_stop_in_any_pass_leaves_an_estimate(
-    experiment: mjfim.Experiment,
-    recordings: list[mjfim.Recording],
-    after: int,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr(search, "QUICK_SAMPLES", 60)
-    stop = StopToken()
-    with StoppingThreads(stop, after) as threads:
-        found = mjfim.identify(
-            experiment.replace(fit=SEGMENTS), recordings, threads=1, executor=threads, stop=stop
-        )
-
-    assert np.isfinite(found.theta).all()
-    assert found.interrupted
 
 
 def test_a_request_to_stop_ends_waiting_works_and_later_passes_are_done_here(
