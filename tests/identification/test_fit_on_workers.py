@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
@@ -103,28 +103,24 @@ def test_a_fit_that_diverges_on_workers_has_no_cost(
         assert divided.condense(at) is None
 
 
-class StoppingThreads(ThreadPoolExecutor):
-    """Threads that ask for a stop when some number of tasks was submitted, and lose no task."""
-
-    def __init__(self, stop: StopToken, after: int) -> None:
-        super().__init__(1)
-        self._stop = stop
-        self._left = after
-
-    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
-        self._left -= 1
-        if self._left == 0:
-            self._stop.request()
-        return super().submit(fn, *args, **kwargs)
-
-
 def test_a_request_to_stop_ends_waiting_works_and_later_passes_are_done_here(
-    experiment: mjfim.Experiment, recordings: list[mjfim.Recording]
+    experiment: mjfim.Experiment,
+    recordings: list[mjfim.Recording],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    """Threads, which lose no task, ask for a stop when the first task is submitted."""
     problem = problem_of(experiment, recordings, SEGMENTS)
     at = problem.begin(problem.system.parameters.guess)
     stop = StopToken()
-    with StoppingThreads(stop, 1) as threads:
+    with ThreadPoolExecutor(1) as threads:
+        submit = threads.submit
+
+        def stopping(*work: Any) -> Future[Any]:
+            """Ask for a stop, and submit as always."""
+            stop.request()
+            return submit(*work)
+
+        monkeypatch.setattr(threads, "submit", stopping)
         divided = replace(problem, workers=FitWorkers(threads))
         works = [partial(cost_at, at=at)] * 4
         assert len(list(divided.of_whole(works, Budget(stop=stop)))) < 4
