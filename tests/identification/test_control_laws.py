@@ -79,16 +79,9 @@ def test_plant_gains_and_latency_are_found_from_references_and_feedforward() -> 
 
     require_found(found, true)
     assert (found.std < 0.05 * np.abs(true))[[0, 2, 3, 5]].all()
-
-    # The estimate says which laws ran in the loop, with the identified numbers.
-    shoulder, elbow = found.controllers
-    assert shoulder.rate == 250.0
-    assert shoulder.numbers["kp"] == found.theta[2]
+    shoulder, _ = found.controllers
     assert shoulder.estimated == ("kp", "latency")
     assert shoulder.columns == ("reference:shoulder", "feedforward:shoulder")
-    assert elbow.columns == ("reference:elbow",)
-    assert "latency" in shoulder.toml
-    assert found.summary()["controllers"][0]["numbers"]["kp"] == found.theta[2]
 
 
 def test_derivatives_agree_with_differences_of_a_plain_loop() -> None:
