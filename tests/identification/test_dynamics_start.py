@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.testing import assert_allclose, assert_array_equal
+from numpy.testing import assert_allclose
 
 import mjfim
 from mjfim.errors import MjfimError, SimulationDivergedError
@@ -42,23 +42,15 @@ def started(
 
 
 @pytest.mark.slow
-def test_the_estimate_starts_from_the_equation_of_motion_and_is_saved_shown_and_drawn(
-    folder: Path, log: Recording, tmp_path: Path
+def test_the_estimate_starts_from_the_equation_of_motion_and_is_shown(
+    folder: Path, log: Recording
 ) -> None:
     estimate, experiment = started(folder, log, [8.0, 3.0, 9.0, 0.1], start="inverse_dynamics")
     assert estimate.restart is None
     fit = estimate.inverse_dynamics
     assert (np.abs(fit.theta / true_of(experiment) - 1.0) < 0.1).all()
-
-    estimate.save(tmp_path)
-    loaded = Estimate.load(tmp_path)
-    first, second = loaded.residual_forces[0], estimate.residual_forces[0]
-    assert_array_equal(first.force, second.force)
-    assert loaded.summary()["inverse_dynamics"]["equations"][1]["name"] == "hinge"
-    assert "Residual torque" in [section.title for section in page_of(loaded).sections]
-    loaded.plot("residual_torque", file=tmp_path / "forces.png")
-    assert (tmp_path / "forces.png").stat().st_size > 10_000
-    assert "The equation of motion holds" in loaded.inverse_dynamics._repr_html_()
+    assert "Residual torque" in [section.title for section in page_of(estimate).sections]
+    assert "The equation of motion holds" in fit._repr_html_()
 
 
 @pytest.mark.slow
