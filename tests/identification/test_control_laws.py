@@ -75,7 +75,7 @@ def test_plant_gains_and_latency_are_found_from_references_and_feedforward() -> 
     )
     true = System.resolve(experiment).parameters.true
 
-    found = mjfim.identify(experiment, [log_of(experiment, 400, 1)], progress=False)
+    found = mjfim.identify(experiment, [log_of(experiment, 400, 1)])
 
     require_found(found, true)
     assert (found.std < 0.05 * np.abs(true))[[0, 2, 3, 5]].all()
@@ -165,27 +165,6 @@ def test_segments_know_the_integral_of_the_law(off: int, tolerance: float) -> No
     # Without the integral at their begins, segments would not follow.
     forgotten = recording.ctrl * (np.arange(recording.ctrl.shape[1]) < 3)
     assert error(replace(recording, ctrl=forgotten)) > 0.02
-
-
-def test_a_check_of_a_log_knows_the_law() -> None:
-    """Gain of the motor and gains of the law have one effect, which no reference tells apart."""
-    motor = {"target": "actuator/shoulder:gainprm[0]", "guess": 1.0}
-    kp = {"target": "controller/shoulder:kp"}
-    kd = {"target": "controller/shoulder:kd"}
-    experiment = arm_experiment(
-        {"shoulder": {**SHOULDER, "saturation": (-90.0, 90.0), "gain": True}},
-        parameters={"motor": motor, "kp": kp, "kd": kd, **PLANT},
-        noise=NOISE,
-    )
-    inputs = 0.2 * references(400, 5, 3, steps=0.0)
-    inputs[:, 1] = 1.0
-    found = mjfim.check(experiment, [mjfim.simulate(experiment, inputs)], progress=False)
-
-    (group,) = found.not_separable
-    assert set(group.members) == {"motor", "kp", "kd"}
-    assert found.self_test.passed
-    mass = next(row for row in found.rows if row.name == "mass")
-    assert np.isfinite(mass.std)
 
 
 def test_an_unstable_loop_is_explained(tmp_path: Path) -> None:
@@ -278,7 +257,7 @@ def test_intervals_of_a_fit_over_segments_with_a_motor_that_lags() -> None:
     true = System.resolve(experiment).parameters.true
     assert FitProblem.of(System.resolve(experiment), [log]).private_count == 5
 
-    found = mjfim.identify(experiment, [log], progress=False)
+    found = mjfim.identify(experiment, [log])
     require_found(found, true)
     assert np.abs(found.theta / true - 1.0).max() < 0.2
     assert abs(found.theta[2] - 0.02) < 1e-3
