@@ -59,27 +59,6 @@ def inner(motion: MeasuredMotion, samples: Array, dt: float) -> tuple[Array, Arr
     return np.stack(columns, axis=1), inside
 
 
-@pytest.mark.parametrize("integrator", ["RK4", "implicitfast"])
-@pytest.mark.parametrize("kinds", [ALL, ("qpos",)])
-def test_states_of_a_simulation_are_found(
-    kinds: tuple[str, ...], integrator: str, tmp_path: Path
-) -> None:
-    task = cart_task(tmp_path, integrator=integrator, horizon=4.0)
-    motion, _, qvel = motion_of(task, kinds)
-    expected, inside = inner(motion, qvel, task.dt)
-
-    # Half a timestep, by which the velocities of implicit steps are earlier, is more.
-    assert np.abs(motion.qvel[inside] - expected).max() < 0.005 * np.abs(qvel).max()
-    # The mean acceleration of the step that begins at a sample, or with RK4, whose steps have no
-    # mean that the equation of motion contains, that at the sample.
-    steps = np.diff(qvel, axis=0) / task.dt
-    if integrator == "RK4":
-        steps = np.gradient(qvel, task.dt, axis=0)
-    acceleration, _ = inner(motion, steps, task.dt)
-    error = motion.qacc[inside] - acceleration
-    assert np.sqrt(np.mean(error**2)) < 0.05 * np.sqrt(np.mean(acceleration**2))
-
-
 def test_orientations_turn_with_the_angular_velocity_of_the_body(tmp_path: Path) -> None:
     task = body_task(tmp_path, noise={"state": 0.01}, horizon=3.0)
     motion, qpos, qvel = motion_of(task, ("qpos",))
