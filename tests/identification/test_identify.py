@@ -81,22 +81,13 @@ def test_both_methods_find_the_minimum_of_the_weighted_squares(
         assert_allclose(theta, slow.x, atol=1e-5)
 
 
-@pytest.mark.slow
-def test_recording_with_fewer_outputs_and_gaps_still_fits(
-    task: DesignTask, recording: Recording
-) -> None:
-    y = np.array(recording.y[:, :2])
-    y[50:80, 1] = np.nan
-    part = replace(recording, y=y, outputs=recording.outputs[:2])
-    estimate = identify_system(task.system, [part])
-    assert estimate.dof == 2 * 200 - 30 - 3
-    assert np.all(np.abs(estimate.theta - task.parameters.true) < 5 * estimate.std)
-
-
 def test_newton_outside_the_bounds_is_no_success(recording: Recording) -> None:
     tight = cart_pendulum(parameters={"c": {"bounds": [1.2, 10.0], "true": 1.3}})
-    estimate = identify(tight, [recording], method="newton")
+    y = np.where(np.arange(201)[:, None] % 7 == 3, np.nan, recording.y)[:, :3]
+    part = replace(recording, y=y, outputs=recording.outputs[:3])
+    estimate = identify(tight, [part], method="newton")
     assert not estimate.converged
+    assert estimate.dof == np.isfinite(y[1:]).sum() - 3
     assert any("outside its bounds" in sentence for sentence in estimate.warnings)
 
 
@@ -160,19 +151,6 @@ def test_an_interruption_after_the_search_keeps_the_estimate(
     assert found.interrupted and found.predictions == ()
     assert_array_equal(found.theta, estimate.theta)
     assert any(sentence.startswith("interrupted after the search") for sentence in found.warnings)
-
-
-def test_a_search_without_a_budget_gives_no_partial_result(
-    task: DesignTask, recording: Recording, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Ctrl-C at a linearisation raises KeyboardInterrupt as usual."""
-
-    def condense(*_: object) -> None:
-        signal.raise_signal(signal.SIGINT)
-
-    monkeypatch.setattr(FitProblem, "condense", condense)
-    with pytest.raises(KeyboardInterrupt):
-        least_squares(FitProblem.of(task.system, [recording]), task.parameters.guess)
 
 
 def test_an_interrupted_round_of_a_campaign_is_not_kept(
