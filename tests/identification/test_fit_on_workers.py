@@ -155,3 +155,8 @@ def test_each_part_is_predicted_from_the_others_as_in_one_process(
         assert np.array_equal(here.identified.rms, there.identified.rms)
         assert np.array_equal(here.nominal.mae, there.nominal.mae)
     assert np.ptp(np.diff(steps)) == 0
+
+    # The fit to all recordings has other errors.
+    predicted, *_ = problem.predict(solution.unknowns)
+    fitted = np.sqrt(np.mean((predicted - recordings[0].y)[1:] ** 2, axis=0))
+    assert not np.isclose(found[0][0].identified.rms, fitted, rtol=1e-6).any()
