@@ -1,4 +1,4 @@
-"""Tests of whiteness against theory: rate of false alarms, and power against coloured residuals."""
+"""Tests of whiteness against theory: the rate of false alarms, the statistic and its times."""
 
 from __future__ import annotations
 
@@ -12,8 +12,6 @@ from mjfim.identification.assessment.residual_tests import LAGS, whiteness_of
 from mjfim.records.estimate import Whiteness
 from tests.support.numerics import Array
 
-N = 4000
-
 
 def autoregressive(phi: float, count: int, rng: np.random.Generator) -> Array:
     """AR(1) noise of unit variance, from its stationary distribution."""
@@ -22,10 +20,9 @@ def autoregressive(phi: float, count: int, rng: np.random.Generator) -> Array:
     return lfilter([1.0], [1.0, -phi], e)
 
 
-def seen(seed: int, extra: Array | float = 0.0, phi: float = 0.0, count: int = N) -> Whiteness:
-    """Test of one series of noise with an added signal."""
-    rng = np.random.default_rng(seed)
-    return whiteness_of("y", [autoregressive(phi, count, rng) + extra])
+def seen(seed: int, count: int, phi: float = 0.0) -> Whiteness:
+    """Test of one series of noise."""
+    return whiteness_of("y", [autoregressive(phi, count, np.random.default_rng(seed))])
 
 
 @pytest.mark.parametrize("missing", [0.0, 0.3])
@@ -38,36 +35,16 @@ def test_white_noise_rarely_fails(lengths: tuple[int, ...], missing: float) -> N
     rng = np.random.default_rng(len(lengths))
     draws, p = 400, np.empty(400)
     for k in range(draws):
-        parts = [3.0 * rng.standard_normal(n) for n in lengths]
-        for part in parts:
-            gaps = rng.random(len(part)) < missing
-            gaps[: len(part) // 5] = missing > 0.0
-            part[gaps] = np.nan
+        parts = [
+            np.where(rng.random(n) < missing, np.nan, 3.0 * rng.standard_normal(n)) for n in lengths
+        ]
+        parts[-1][: round(missing * lengths[-1])] = np.nan
         found = whiteness_of("y", parts)
         assert found.count == np.isfinite(np.concatenate(parts)).sum()
         p[k] = found.p
     for level in (0.2, 0.05, 0.01):
         assert (p < level).sum() <= binom.ppf(0.999, draws, level), f"at {level}"
     assert max(lengths) < 1000 or (p < 0.2).mean() > 0.05, "and not for want of looking"
-
-
-ROWS = np.arange(N)
-
-
-@pytest.mark.parametrize(
-    "extra",
-    [
-        pytest.param(np.linspace(-0.3, 0.3, N), id="slow drift"),
-        pytest.param(0.2 * np.sin(2 * np.pi * ROWS / 1500), id="slow sinusoid"),
-        pytest.param(0.5 * np.sin(2 * np.pi * ROWS / 5.3), id="fast sinusoid"),
-        pytest.param(0.15, id="offset"),
-        pytest.param(np.where(ROWS % 400 < 30, 0.7, 0.0), id="bursts"),
-    ],
-)
-def test_small_signals_in_noise_are_found(extra: Array | float) -> None:
-    """All signals are smaller than the noise; short lags alone would miss the slow ones."""
-    assert sum(seen(seed, extra).p < 1e-3 for seed in range(20)) >= 18
-    assert seen(0, extra).variance < 1.2
 
 
 def test_borders_of_recordings_are_not_crossed() -> None:
@@ -97,6 +74,9 @@ def test_the_statistic_is_that_of_ljung_and_box() -> None:
         assert found.p == pytest.approx(min(4 * min(tails), 1.0), rel=1e-8)
         assert found.correlation == pytest.approx(rho[1], rel=1e-10)
         assert found.inflation == pytest.approx(max(1.0, *ratios), rel=1e-10)
+        assert found.variance == pytest.approx(np.mean(y**2), rel=1e-10)
+        # Alternating noise has no memory.
+        assert phi > 0.0 or found.time == 1.0
 
 
 @pytest.mark.parametrize(
@@ -106,17 +86,6 @@ def test_the_integrated_time_is_that_of_theory(phi: float, time: float) -> None:
     """The mean over draws is (1 + phi) / (1 - phi)."""
     times = [seen(seed, phi=phi, count=30_000).time for seed in range(12)]
     assert np.mean(times) == pytest.approx(time, rel=0.12 if phi else 0.02)
-
-
-def test_variance_and_inflation() -> None:
-    """The variance is relative to the noise; the inflation of white noise is close to 1."""
-    rng = np.random.default_rng(0)
-    found = whiteness_of("speed", [2.0 * rng.standard_normal(20_000)])
-    assert found.output == "speed"
-    assert found.variance == pytest.approx(4.0, rel=0.05)
-    assert 1.0 <= found.inflation < 2.5
-    # Alternating noise has no memory.
-    assert seen(0, phi=-0.6).time == 1.0
 
 
 @pytest.mark.parametrize(
