@@ -188,7 +188,7 @@ def test_white_noise_of_another_size_is_no_misfit(filtered: bool, ratio: float, 
     noise = log.y - clean.y
     if filtered:
         noise[1:] = (noise[1:] + noise[:-1]) / np.sqrt(2.0)
-    found = mjfim.identify(experiment, [replace(log, y=clean.y + noise)], progress=False)
+    found = mjfim.identify(experiment, [replace(log, y=clean.y + noise)])
     assert found.misfit == filtered
     page = estimate_page(found)
     sentence = page.verdict.sentence
