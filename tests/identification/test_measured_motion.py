@@ -23,21 +23,17 @@ from mjfim.records.trajectory import Recording
 from tests.support.numerics import Array, body_task, cart_task
 from tests.support.terms import recorded
 
-MOST = 10_000
-ALL = ("qpos", "qvel")
-
 
 def motion_of(
     task: DesignTask,
-    kinds: tuple[str, ...] = ALL,
     hidden: tuple[str, ...] = (),
     rows: Array | slice = slice(None),
 ) -> tuple[MeasuredMotion, Array, Array]:
-    """Motion of a recording without noise, and (N+1, nq), (N+1, nv) what was measured."""
+    """Motion from positions without noise, and (N+1, nq), (N+1, nv) what was simulated."""
     guess = task.parameters.guess
     made = recorded(task.system, task.control, theta=guess, share=0.0)
     columns = [
-        i for i, name in enumerate(made.outputs) if name.startswith(kinds) and name not in hidden
+        i for i, name in enumerate(made.outputs) if name.startswith("qpos") and name not in hidden
     ]
     recording = Recording(
         t=made.t[rows],
@@ -46,7 +42,7 @@ def motion_of(
         outputs=tuple(made.outputs[i] for i in columns),
         name="x.csv",
     )
-    motion = measured_motion(task.system, align(task.system, recording), guess, MOST)
+    motion = measured_motion(task.system, align(task.system, recording), guess, 10_000)
     nq = task.space.nq
     return motion, made.y[:, :nq], made.y[:, nq:]
 
@@ -61,7 +57,7 @@ def inner(motion: MeasuredMotion, samples: Array, dt: float) -> tuple[Array, Arr
 
 def test_orientations_turn_with_the_angular_velocity_of_the_body(tmp_path: Path) -> None:
     task = body_task(tmp_path, noise={"state": 0.01}, horizon=3.0)
-    motion, qpos, qvel = motion_of(task, ("qpos",))
+    motion, qpos, qvel = motion_of(task)
     expected, inside = inner(motion, qvel, task.dt)
     assert np.abs(motion.qvel[inside] - expected).max() < 0.02 * np.abs(qvel).max()
     change = np.gradient(expected, motion.step, axis=0)
