@@ -76,13 +76,14 @@ def irregular(log: Recording) -> Recording:
 @pytest.mark.parametrize(
     ("fit", "changed", "rtol"),
     [
-        pytest.param({}, replace, TOLERANCE, id="from the stated start"),
-        pytest.param({}, late, TOLERANCE, id="from the middle of a motion"),
-        pytest.param({}, irregular, TOLERANCE, id="irregular rows"),
-        pytest.param({"start": "measured"}, replace, TOLERANCE, id="from a measured start"),
-        pytest.param({"segments": 0.5}, replace, TOLERANCE, id="segments"),
-        pytest.param({"segments": 1.0, "hold": ["m"]}, replace, TOLERANCE, id="a held parameter"),
-        pytest.param({"segments": 0.7}, replace, 0.1, id="an end that is no whole segment"),
+        ({}, replace, TOLERANCE),
+        ({}, late, TOLERANCE),
+        ({}, irregular, TOLERANCE),
+        ({"start": "measured"}, replace, TOLERANCE),
+        ({"segments": 0.5}, replace, TOLERANCE),
+        ({"segments": 1.0, "hold": ["m"]}, replace, TOLERANCE),
+        # The end is no whole segment.
+        ({"segments": 0.7}, replace, 0.1),
     ],
 )
 def test_a_stream_tells_what_a_fit_of_the_recording_predicts(
