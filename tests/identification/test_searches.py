@@ -193,11 +193,12 @@ def of_segments(samples: int, count: int) -> Any:
 @pytest.mark.parametrize(
     ("samples", "count", "wanted"),
     [
-        pytest.param(24_800, 25, 6, id="a quarter"),
-        pytest.param(24_800, 4, 4, id="too few segments"),
-        pytest.param(4_000, 100, 100, id="too few samples"),
-        pytest.param(4_000_000, 1000, 10, id="much data"),
+        (24_800, 25, 6),
+        (24_800, 4, 4),
+        (4_000, 100, 100),
+        (4_000_000, 1000, 10),
     ],
+    ids=["a quarter", "too few segments", "too few samples", "much data"],
 )
 def test_a_search_begins_on_a_part_that_is_large_enough(
     samples: int, count: int, wanted: int
@@ -233,10 +234,11 @@ def begin_of(theta: float) -> UnknownValues:
 @pytest.mark.parametrize(
     ("minimum", "limit", "expected"),
     [
-        pytest.param(3.0, np.inf, 3.0, id="the part is like the rest"),
-        pytest.param(1.0, np.inf, 1.1, id="the rest costs more"),
-        pytest.param(2.9, 2.0, 1.1, id="the rest diverges"),
+        (3.0, np.inf, 3.0),
+        (1.0, np.inf, 1.1),
+        (2.9, 2.0, 1.1),
     ],
+    ids=["the part is like the rest", "the rest costs more", "the rest diverges"],
 )
 def test_the_search_over_all_data_begins_where_all_data_cost_less(
     minimum: float, limit: float, expected: float
