@@ -66,15 +66,13 @@ def stated(folder: Path) -> mjfim.Experiment:
     )
 
 
-def with_stribeck(experiment: mjfim.Experiment, joints: tuple[str, ...]) -> mjfim.Experiment:
-    """The arm with Stribeck friction at some joints."""
-    values = {joint: {"excess": e, "speed": 0.15} for joint, e in zip(JOINTS, EXCESS, strict=True)}
-    return experiment.replace(
-        terms={
-            f"s_{joint}": {"kind": "stribeck", "joint": joint, "values": values[joint]}
-            for joint in joints
-        }
-    )
+def with_stribeck(experiment: mjfim.Experiment) -> mjfim.Experiment:
+    """The arm with Stribeck friction at all joints."""
+    terms = {}
+    for joint, excess in zip(JOINTS, EXCESS, strict=True):
+        values = {"excess": excess, "speed": 0.15}
+        terms[f"s_{joint}"] = {"kind": "stribeck", "joint": joint, "values": values}
+    return experiment.replace(terms=terms)
 
 
 def log_of(experiment: mjfim.Experiment, seed: int) -> Recording:
@@ -94,7 +92,7 @@ def term_tests(experiment: mjfim.Experiment, log: Recording) -> TermTests:
 @pytest.mark.slow
 def test_friction_that_all_joints_lack_is_named_first_and_as_one_term(tmp_path: Path) -> None:
     experiment = stated(tmp_path)
-    tests = term_tests(experiment, log_of(with_stribeck(experiment, JOINTS), 0))
+    tests = term_tests(experiment, log_of(with_stribeck(experiment), 0))
     first = tests.terms[0]
     assert first.description == "Stribeck friction at 3 joints"
     assert set(first.joints) == set(JOINTS)
