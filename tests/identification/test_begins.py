@@ -42,7 +42,7 @@ def test_a_log_that_begins_elsewhere_is_fitted_and_said(
     log = swung(experiment if kind == "late" else moved(experiment))
     if kind == "late":
         log = replace(log, t=log.t[100:], ctrl=log.ctrl[100:], y=log.y[100:])
-    estimate = mjfim.identify(experiment, [log], progress=False)
+    estimate = mjfim.identify(experiment, [log])
     assert not estimate.misfit and estimate.converged
     (sentence,) = [each for each in estimate.warnings if "does not begin where [initial]" in each]
     assert said in sentence and ("slide" in sentence) == (kind == "late")
@@ -72,7 +72,7 @@ def test_another_reading_of_an_encoder_is_named_with_the_line_that_cures_it(
     shifted = replace(log, y=np.where(is_wrong, scale * log.y + zero, log.y))
     word = "zero" if zero else "scale"
     with pytest.raises(WrongLogError, match=f"another {word} of qpos:hinge") as error:
-        mjfim.identify(experiment, [shifted], progress=False)
+        mjfim.identify(experiment, [shifted])
     cure = tomllib.loads(str(error.value).partition("State in [recording.columns]: ")[2])
     column = cure["qpos:hinge"]
     assert column.get("offset", 0.0) == pytest.approx(-zero, abs=0.02)
@@ -88,7 +88,7 @@ def test_a_log_that_begins_elsewhere_and_misfits_is_fitted(
     robot = tmp_path / "robot.xml"
     robot.write_text(text.replace('axis="1 0 0"/>', 'axis="1 0 0" frictionloss="0.5"/>'))
     made = moved(experiment).replace(model=str(robot))
-    estimate = mjfim.identify(experiment, [swung(made)], progress=False)
+    estimate = mjfim.identify(experiment, [swung(made)])
     assert any("does not begin where [initial] says" in each for each in estimate.warnings)
     assert "dry friction of slide" in estimate.causes[0]
 

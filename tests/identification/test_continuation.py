@@ -13,8 +13,6 @@ import mjfim
 from mjfim.experiment.system import System
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.identify import identify_system
-from mjfim.parallel.budget import StopToken
-from mjfim.records.events import FitEvent
 from mjfim.records.trajectory import Recording
 from tests.support.numerics import require_found
 from tests.support.terms import recorded
@@ -90,16 +88,6 @@ def test_a_wrong_start_finds_the_truth_over_many_swings(
         assert "fell from" in found.summary()["restart"]["words"]
 
 
-def test_a_right_first_fit_is_not_repeated(tmp_path: Path) -> None:
-    system = pendulum(tmp_path, 4.0)
-    phases = set()
-    found = identify_system(
-        system, [swings(system, 4.0)], callback=lambda event: phases.add(event.phase)
-    )
-    require_found(found, system.parameters.true)
-    assert found.restart is None and phases == {"all data"}
-
-
 @pytest.mark.slow
 def test_deviations_of_the_initial_state_and_biases_are_continued_too(tmp_path: Path) -> None:
     """Parameters of the initial state are no unknowns of segments, the others are."""
@@ -125,22 +113,6 @@ def test_a_wrong_model_keeps_the_lower_cost_of_all_fits(tmp_path: Path) -> None:
     assert found.misfit
     assert found.restart.cost <= found.restart.cost_before
     assert found.missing_terms[0].path == "joint/hinge:frictionloss"
-
-
-@pytest.mark.slow
-def test_a_request_to_stop_during_the_restart_keeps_the_best_result(tmp_path: Path) -> None:
-    system = pendulum(tmp_path, 12.0)
-    stop = StopToken()
-
-    def press(event: FitEvent) -> None:
-        """Ask to stop in the first fit over segments."""
-        if event.phase.startswith("segments"):
-            stop.request()
-
-    start = system.parameters.true * START
-    found = identify_system(system, [swings(system, 12.0)], start=start, callback=press, stop=stop)
-    assert found.interrupted
-    assert found.restart.cost <= found.restart.cost_before
 
 
 def test_segments_of_a_problem_are_cut_where_they_are_long_enough(tmp_path: Path) -> None:

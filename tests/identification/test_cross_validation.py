@@ -59,23 +59,6 @@ def test_held_out_errors_are_the_noise_and_the_nominal_ones_are_not(base: mjfim.
 
 
 @pytest.mark.slow
-def test_without_held_out_recordings_each_is_predicted_by_the_others(
-    short: mjfim.Experiment,
-) -> None:
-    task = DesignTask.resolve(short)
-    recordings = [recorded(task, seed) for seed in range(3)]
-    # Not from the beginning, where the initial state would be another one.
-    jump = 0.2 * (np.arange(len(recordings[2].t)) > 8)
-    spoilt = replace(recordings[2], y=recordings[2].y + jump[:, None], name="spoilt")
-    found = identify_system(task.system, [*recordings[:2], spoilt])
-    assert [p.name for p in found.predictions] == ["simulated", "simulated", "spoilt"]
-    assert not any(p.held_out for p in found.predictions)
-
-    # The fit to the other recordings does not explain the offset of this one.
-    assert (found.predictions[2].identified.rms > 0.15).all()
-
-
-@pytest.mark.slow
 def test_a_single_recording_predicts_its_end(base: mjfim.Experiment) -> None:
     task = DesignTask.resolve(base)
     recording = recorded(task, 0)
@@ -102,7 +85,6 @@ def test_every_recording_has_a_separate_bias(short: mjfim.Experiment) -> None:
     found = identify_system(task.system, recordings)
     assert_allclose(found.per_recording["bias qpos:hinge"], biases, atol=0.02)
     assert found.parameters[3] == "bias qpos:hinge"
-    assert found.theta[3] == found.per_recording["bias qpos:hinge"][0]
     assert np.all(np.abs(found.theta[:3] - task.parameters.true[:3]) < 4.0 * found.std[:3])
     assert not found.misfit
     assert mjfim.identify(one, recordings).misfit
@@ -117,17 +99,6 @@ def test_every_recording_has_a_separate_bias(short: mjfim.Experiment) -> None:
 def test_per_recording_belongs_to_nuisance(base: mjfim.Experiment) -> None:
     with pytest.raises(mjfim.MjfimError, match="nuisance = true"):
         base.replace(parameters={"m": {"per_recording": True}})
-
-
-def test_poor_data_are_described_and_good_data_are_not(base: mjfim.Experiment) -> None:
-    task = DesignTask.resolve(base)
-    good = recorded(task, 0)
-    assert plausibility_remarks(task.system.channels, good) == ()
-    rng = np.random.default_rng(0)
-    y = good.y + rng.normal(size=good.y.shape) * [0.0, 0.0, 0.0, 2.0]
-    noisy = replace(good, ctrl=good.ctrl + rng.normal(0.0, 20.0, good.ctrl.shape), y=y)
-    remarks = " ".join(plausibility_remarks(task.system.channels, noisy))
-    assert "jumps from row to row" in remarks and "qvel:hinge is rough" in remarks
 
 
 def test_a_quick_motion_of_a_drone_is_not_taken_for_noise() -> None:
@@ -146,6 +117,11 @@ def test_a_quick_motion_of_a_drone_is_not_taken_for_noise() -> None:
 
     assert "qvel:base.rx is rough" in remarks(flight, None)
     assert not remarks(flight, exact)
+
+    # A control that jumps from row to row is named.
+    jumping = replace(flight, ctrl=np.random.default_rng(0).normal(size=ctrl.shape))
+    found = " ".join(plausibility_remarks(system.channels, jumping, exact))
+    assert "jumps from row to row" in found
 
     # Spikes are found beside the same motion, in any unit of the output.
     i = flight.outputs.index("qvel:base.rx")

@@ -123,6 +123,3 @@ def test_an_estimate_and_a_selection_say_on_how_much_terms_were_tested(
     assert ending.startswith(f"No further term that was tested is significant. {words}")
     assert ending.endswith("cannot have it: a strange spring.")
     assert any("a strange spring" in sentence for sentence in found.warnings)
-
-    found.save(tmp_path / "out")
-    assert mjfim.Estimate.load(tmp_path / "out").tested_data == found.tested_data

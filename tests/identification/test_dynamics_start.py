@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.testing import assert_allclose, assert_array_equal
+from numpy.testing import assert_allclose
 
 import mjfim
 from mjfim.errors import MjfimError, SimulationDivergedError
 from mjfim.output.pages import page_of
 from mjfim.records.estimate import Estimate
 from mjfim.records.trajectory import Recording
-from tests.identification.test_inverse_dynamics import STATE, cart, cart_log, true_of
+from tests.identification.test_inverse_dynamics import cart, cart_log, true_of
 from tests.support.numerics import require_found
 
 
@@ -34,7 +33,7 @@ def started(
     """An estimate from a start that is wrong by factors, which finds the truth."""
     experiment = cart(folder, fit={"bootstrap": 0, **fit})
     true = true_of(experiment)
-    found = mjfim.identify(experiment, [log], start=true * factors, progress=False)
+    found = mjfim.identify(experiment, [log], start=true * factors)
     require_found(found, true, 5.0)
     # The guess remains the one that the user stated.
     assert_allclose(found.initial_theta, true * factors)
@@ -42,23 +41,15 @@ def started(
 
 
 @pytest.mark.slow
-def test_the_estimate_starts_from_the_equation_of_motion_and_is_saved_shown_and_drawn(
-    folder: Path, log: Recording, tmp_path: Path
+def test_the_estimate_starts_from_the_equation_of_motion_and_is_shown(
+    folder: Path, log: Recording
 ) -> None:
     estimate, experiment = started(folder, log, [8.0, 3.0, 9.0, 0.1], start="inverse_dynamics")
     assert estimate.restart is None
     fit = estimate.inverse_dynamics
     assert (np.abs(fit.theta / true_of(experiment) - 1.0) < 0.1).all()
-
-    estimate.save(tmp_path)
-    loaded = Estimate.load(tmp_path)
-    first, second = loaded.residual_forces[0], estimate.residual_forces[0]
-    assert_array_equal(first.force, second.force)
-    assert loaded.summary()["inverse_dynamics"]["equations"][1]["name"] == "hinge"
-    assert "Residual torque" in page_of(loaded).sections
-    loaded.plot("residual_torque", file=tmp_path / "forces.png")
-    assert (tmp_path / "forces.png").stat().st_size > 10_000
-    assert "The equation of motion holds" in loaded.inverse_dynamics._repr_html_()
+    assert "Residual torque" in page_of(estimate).sections
+    assert "The equation of motion holds" in fit._repr_html_()
 
 
 @pytest.mark.slow
@@ -81,18 +72,11 @@ def test_a_model_that_diverges_at_the_start_begins_at_the_equation_of_motion(
 
     # The paper's method starts where it is told.
     with pytest.raises(SimulationDivergedError, match="diverges at the start"):
-        mjfim.identify(
-            experiment, [log], start=found.initial_theta, method="newton", progress=False
-        )
+        mjfim.identify(experiment, [log], start=found.initial_theta, method="newton")
 
 
 def test_what_it_needs_is_said(folder: Path, log: Recording) -> None:
     experiment = cart(folder, fit={"start": "inverse_dynamics"})
-    part = replace(log, y=log.y[:, [0, 2]], outputs=(STATE[0], STATE[2]), name="part.csv")
     moved = experiment.replace(nuisance={"initial": 0.1})
-    for stated, given, said in (
-        (experiment, part, r"part\.csv: no measured position or velocity of h"),
-        (moved, log, r'fit\.start = "inverse_dynamics" is stated'),
-    ):
-        with pytest.raises(MjfimError, match=said):
-            mjfim.identify(stated, [given], progress=False)
+    with pytest.raises(MjfimError, match=r'fit\.start = "inverse_dynamics" is stated'):
+        mjfim.identify(moved, [log])

@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.linalg import block_diag
 
-import mjfim
-from mjfim.excitation import DesignTask
 from mjfim.experiment.system import System
 from mjfim.identification.assessment.honest_covariance import (
     AGREEMENT,
@@ -26,7 +23,6 @@ from tests.identification.test_horizons import made_study
 from tests.identification.test_parameter_draws import COVARIANCE, STD, estimated
 from tests.support.cart_pendulum import cart_pendulum
 from tests.support.numerics import Array
-from tests.support.terms import recorded
 
 # Mass and lever, known to 10 % each, and their product to 0.1 %.
 PRODUCT = np.array([1.0, 1.0]) / np.sqrt(2.0)
@@ -47,20 +43,6 @@ def system() -> System:
 # ---- agreement with intervals
 
 
-def test_one_wider_interval_leaves_a_known_product_known(system: System) -> None:
-    std = np.sqrt(np.diag(NARROW)) * [1.0, 1.05]
-    found = agreeing_covariance(NARROW, std)
-    assert size(found, PRODUCT) == pytest.approx(KNOWN, rel=1e-2)
-    ratio = np.sqrt(np.diag(found)) / std
-    assert ratio[1] == pytest.approx(1.0)
-    assert 1.0 <= ratio[0] <= 1.05
-
-    # A common factor changes no correlation.
-    std = np.sqrt(np.diag(NARROW))
-    assert_allclose(agreeing_covariance(9.0 * NARROW, std), NARROW, rtol=1e-9)
-    assert_allclose(agreeing_covariance(NARROW, std), NARROW, rtol=1e-9)
-
-
 def test_standard_deviations_agree_with_all_intervals() -> None:
     rng = np.random.default_rng(1)
     factor = rng.standard_normal((6, 6)) * np.geomspace(1e-6, 1e3, 6)[:, None]
@@ -73,6 +55,11 @@ def test_standard_deviations_agree_with_all_intervals() -> None:
     assert ratio[2] < 1.0 + AGREEMENT + 1e-9
     assert not found[3].any()
     assert np.linalg.eigvalsh(found / np.outer(scale, scale)).min() > -1e-9
+
+    # A common factor changes no correlation.
+    std = np.sqrt(np.diag(NARROW))
+    for factor in (1.0, 9.0):
+        assert_allclose(agreeing_covariance(factor * NARROW, std), NARROW, rtol=1e-9)
 
     # Parameters about which the covariance says nothing are uncorrelated.
     alone = agreeing_covariance(np.zeros((2, 2)), np.array([2.0, 0.0]))
@@ -157,13 +144,10 @@ def test_lengths_and_selections_widen_along_their_differences(system: System) ->
 # ---- estimates
 
 
-def test_it_is_saved_and_earlier_estimates_have_none(system: System, tmp_path: Path) -> None:
+def test_it_is_kept_and_earlier_estimates_have_none(system: System) -> None:
     earlier, parameters = estimated(system, COVARIANCE), system.parameters
     saved = with_honest_covariance(earlier, parameters, 4.0 * COVARIANCE)
-    saved.save(tmp_path)
-    loaded = mjfim.Estimate.load(tmp_path)
-    assert_array_equal(honest_covariance(parameters, loaded), saved.honest_covariance)
-    assert loaded.summary()["honest_covariance"] is not None
+    assert_array_equal(honest_covariance(parameters, saved), saved.honest_covariance)
 
     # Without it, formal correlations count.
     assert_allclose(honest_covariance(parameters, earlier), COVARIANCE, rtol=1e-4)
@@ -176,24 +160,3 @@ def test_it_is_saved_and_earlier_estimates_have_none(system: System, tmp_path: P
     differing = replace(saved, per_recording={"c": (1.0, 3.0)})
     added = honest_covariance(parameters, differing) - saved.honest_covariance
     assert_allclose(added, np.diag([0.0, 0.0, 2.0]), atol=1e-12)
-
-
-@pytest.mark.slow
-def test_noise_that_is_larger_than_stated_counts_in_all_combinations() -> None:
-    factor = 1.8
-    experiment = cart_pendulum(fit={"bootstrap": 100, "segments": "whole"})
-    system = System.resolve(experiment)
-    control = DesignTask.of(system).initial.ctrl
-    logs = [recorded(system, control, seed, share=factor) for seed in (1, 2)]
-    found = mjfim.identify(experiment, logs, progress=False)
-    assert not found.misfit
-
-    honest = found.honest_covariance
-    ratio = np.sqrt(np.diag(honest)) / interval_std(system.parameters, found)
-    assert (ratio > 1.0 - 1e-9).all()
-    assert (ratio < 1.02 + AGREEMENT).all()
-
-    # In the axes of the formal covariance.
-    values, axes = np.linalg.eigh(found.covariance / np.outer(found.std, found.std))
-    for value, weights in zip(values, axes.T / found.std, strict=True):
-        assert 0.85 * factor < size(honest, weights) / np.sqrt(value) < 1.6 * factor

@@ -188,7 +188,7 @@ def test_white_noise_of_another_size_is_no_misfit(filtered: bool, ratio: float, 
     noise = log.y - clean.y
     if filtered:
         noise[1:] = (noise[1:] + noise[:-1]) / np.sqrt(2.0)
-    found = mjfim.identify(experiment, [replace(log, y=clean.y + noise)], progress=False)
+    found = mjfim.identify(experiment, [replace(log, y=clean.y + noise)])
     assert found.misfit == filtered
     page = estimate_page(found)
     sentence = page.verdict.sentence
@@ -196,3 +196,6 @@ def test_white_noise_of_another_size_is_no_misfit(filtered: bool, ratio: float, 
     # It is said once.
     assert sum(each.count("noise is") for each in (sentence, *page.warnings)) <= 1
     assert (page.verdict.level is Level.GOOD) != filtered
+    # Larger noise counts in what is known about every parameter.
+    wider = np.sqrt(np.diag(found.honest_covariance)) / found.std
+    assert filtered or (wider > 0.9 * max(ratio, 1.0)).all()

@@ -39,31 +39,6 @@ def rubbing_pendulum(folder: Path) -> Recording:
     return recording
 
 
-@pytest.mark.parametrize(
-    ("field", "amount", "horizon"),
-    [
-        ("frictionloss", 0.5, 2.0),
-        ("damping", 0.6, 4.0),
-        ("stiffness", 2.0, 3.0),
-        ("armature", 0.5, 2.0),
-    ],
-)
-@pytest.mark.slow
-def test_the_missing_term_comes_first_and_in_about_its_size(
-    field: str, amount: float, horizon: float
-) -> None:
-    path = f"joint/slide:{field}"
-    robot = stated(horizon=horizon, parameters={"p": {"target": path, "guess": amount}})
-    found = mjfim.identify(stated(), logs_of(robot, 0))
-    assert found.misfit
-    rank = [s.path for s in found.missing_terms].index(path)
-    assert rank == 0 or field == "armature"  # the bob's inertia does nearly the same
-    first = found.missing_terms[rank]
-    assert first.sigmas > 5.0
-    assert amount / 2.0 < first.main.value < 2.0 * amount
-    assert any(path in sentence for sentence in found.warnings)
-
-
 @pytest.mark.slow
 def test_a_small_term_that_matters_is_found_in_much_data() -> None:
     """A constant force of 6 standard deviations is less than 2e-3 of the squares of this log."""

@@ -65,7 +65,7 @@ def test_an_identified_inertia_is_physical(
     control = 1.5 * np.sin(0.02 * np.arange(600))[:, None]
     log = recorded(System.resolve(experiment(robot)), control, 3)
     stated = experiment("0.01 0.01 5e-4")
-    found = mjfim.identify(stated, [log], progress=False)
+    found = mjfim.identify(stated, [log])
     system = System.resolve(stated)
     assert not system.impossible(found.theta)
     assert ("piece" in found.at_bound) == ("piece" in parameters)

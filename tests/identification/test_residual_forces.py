@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
-from mjfim.errors import RecordingError
 from mjfim.experiment.system import System
 from mjfim.identification.aligned_recording import align
 from mjfim.identification.inverse_dynamics import inverse_dynamics, residual_forces
@@ -81,13 +80,6 @@ def test_each_recording_has_its_own_parameters(tmp_path: Path) -> None:
         for at in ([theta], [heavy], [theta, heavy])
     )
     assert both.rms**2 == pytest.approx(0.5 * (one.rms**2 + other.rms**2), rel=1e-9)
-
-
-def test_a_degree_of_freedom_that_was_not_measured_is_named(tmp_path: Path) -> None:
-    log = cart_log(cart(tmp_path), 1e-3)
-    log = replace(log, y=log.y[:, [0, 2]], outputs=(STATE[0], STATE[2]))
-    with pytest.raises(RecordingError, match="no measured position or velocity of hinge"):
-        forces_along(tmp_path, log)
 
 
 def test_the_picture_shows_the_medians_and_the_worst_joints(tmp_path: Path) -> None:

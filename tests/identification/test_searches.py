@@ -27,19 +27,34 @@ from tests.support.numerics import Array
 
 # Slope of the residuals: the standard deviation of the parameter is 0.01.
 SLOPE = 10.0
-COUNT = 100
 
-# Size of the waves on the residuals, and their length, which is below the steps.
-WAVE = 1e-4
+# Length of the waves on the residuals, which is below the steps.
 WAVE_LENGTH = 1.2345e-9
 
 
-class OneParameter:
-    """What residuals of one unbounded parameter have in common."""
+@dataclass(frozen=True, kw_only=True)
+class Parts:
+    """Residuals of one unbounded parameter: a line for each segment, and short waves on it.
 
-    lower = np.array([-np.inf])
-    upper = np.array([np.inf])
-    curved_rows = None
+    Attributes:
+        segments: Minimum of each segment.
+        limit: Parameter from which the segments with the lower minimum diverge.
+        wave: Size of the waves.
+        step: Step of the differences.
+        sample_count: Number of samples that the problem states.
+    """
+
+    segments: tuple[float, ...] = (1.0,) * 100
+    limit: float = np.inf
+    wave: float = 0.0
+    step: float = 1e-3
+    sample_count: int = 24_800
+
+    lower, upper = np.array([-np.inf]), np.array([np.inf])
+    curved_rows = workers = None
+    free_starts = False
+    noise = SimpleNamespace(sigma=np.ones(1), strides=np.ones(1, dtype=int))
+    value_count, unknown_count = 25, 1
 
     def bounds_at(self, at: UnknownValues) -> tuple[Array, Array]:
         return self.lower, self.upper
@@ -53,16 +68,20 @@ class OneParameter:
         return at.theta
 
     def residuals(self, theta: float) -> Array:
-        """All residuals."""
-        raise NotImplementedError
+        """One residual of each segment."""
+        phases = np.linspace(0.0, 6.0, len(self.segments))
+        waves = np.sin(2.0 * np.pi * theta / WAVE_LENGTH + phases)
+        return SLOPE * (theta - np.array(self.segments)) + self.wave * waves
 
     def cost(self, at: UnknownValues) -> float:
         """Half of the sum of squares."""
+        if at.theta[0] > self.limit and min(self.segments) < 3.0:
+            return np.inf
         return 0.5 * float(np.sum(self.residuals(at.theta[0]) ** 2))
 
-    def condense(self, at: UnknownValues, step: float = 1e-3) -> Condensed:
+    def condense(self, at: UnknownValues) -> Condensed:
         """Linearise by two-sided differences."""
-        theta = at.theta[0]
+        theta, step = at.theta[0], self.step
         slopes = (self.residuals(theta + step) - self.residuals(theta - step)) / (2.0 * step)
         rows = np.column_stack([slopes, self.residuals(theta)])
         return Condensed(
@@ -72,31 +91,29 @@ class OneParameter:
             common_rows=np.zeros((0, 2)),
         )
 
-
-@dataclass(frozen=True)
-class Rough(OneParameter):
-    """Residuals of one parameter, a line with short waves, whose minimum is near 1.
-
-    Attributes:
-        step: Step of the differences.
-    """
-
-    step: float = 1e-7
-    sample_count = COUNT
-
-    def residuals(self, theta: float) -> Array:
-        """(COUNT,) residuals."""
-        phases = np.linspace(0.0, 6.0, COUNT)
-        waves = np.sin(2.0 * np.pi * theta / WAVE_LENGTH + phases)
-        return SLOPE * (theta - 1.0) + WAVE * waves
-
-    def condense(self, at: UnknownValues) -> Condensed:
-        """Linearise by short differences."""
-        return super().condense(at, self.step)
-
-    def with_longer_differences(self, factor: float) -> Rough:
+    def with_longer_differences(self, factor: float) -> Parts:
         """The same residuals with longer steps."""
-        return Rough(step=factor * self.step)
+        return replace(self, step=factor * self.step)
+
+    def of_segments(self, indices: np.ndarray) -> Parts:
+        """Some segments."""
+        return replace(self, segments=tuple(self.segments[i] for i in indices))
+
+    def of_first_parts(self, share: float) -> Parts:
+        """The same, because there is no initial state."""
+        return self
+
+    def errors_at(self, at: UnknownValues) -> list[Array]:
+        """Errors of one output."""
+        return [self.residuals(at.theta[0]) + 0.5]
+
+    def with_noise(self, noise: Any) -> Parts:
+        """Segments that diverge as soon as their noise changes."""
+        return replace(self, limit=-np.inf)
+
+
+# Residuals whose waves spoil short differences.
+ROUGH = Parts(wave=1e-4, step=1e-7, sample_count=100)
 
 
 def search(method: str = "least_squares", *, noise_is_stated: bool = True) -> Any:
@@ -112,7 +129,7 @@ def search(method: str = "least_squares", *, noise_is_stated: bool = True) -> An
 
 def stuck_at(theta: float) -> Solution:
     """A search that ended at once because no step lowered the cost."""
-    ended = minimise(Rough(), begin_of(theta), SearchSettings(max_iterations=1))
+    ended = minimise(ROUGH, begin_of(theta), SearchSettings(max_iterations=1))
     assert not ended.success
     return replace(ended, stuck=True)
 
@@ -120,13 +137,13 @@ def stuck_at(theta: float) -> Solution:
 @pytest.mark.parametrize("begin", [0.7, 1.3])
 def test_longer_differences_lead_over_waves_to_the_minimum(begin: float) -> None:
     stuck = stuck_at(begin)
-    problem, found = search().converged(Rough(), stuck)
+    problem, found = search().converged(ROUGH, stuck)
     assert found.success and found.cost < 1e-3 * stuck.cost
-    assert problem.step > Rough().step
+    assert problem.step > ROUGH.step
     assert abs(found.unknowns.theta[0] - 1.0) < 1e-3
 
     # So does a search that ended near its minimum.
-    found = search().converged(Rough(), replace(stuck, stuck=False, rough=True, success=True))[1]
+    found = search().converged(ROUGH, replace(stuck, stuck=False, rough=True, success=True))[1]
     assert not found.rough and found.cost < 1e-3 * stuck.cost
 
 
@@ -151,7 +168,7 @@ def test_much_data_that_are_missed_end_the_first_search_near_its_minimum(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Half of the residuals belong to another minimum, so that no parameter explains the data."""
-    problem: Any = NoisyParts(segments=(1.0, 3.0) * 50)
+    problem = Parts(segments=(1.0, 3.0) * 50)
     monkeypatch.setattr(search_module, "SAMPLES_OF_MUCH_DATA", 0)
     begin = begin_of(7.0)
     assert not search().solve(problem, begin)[1].rough
@@ -162,10 +179,10 @@ def test_much_data_that_are_missed_end_the_first_search_near_its_minimum(
 
 
 def test_other_ends_of_a_search_stay() -> None:
-    rough, stuck = Rough(), stuck_at(0.7)
+    stuck = stuck_at(0.7)
     ended = replace(stuck, stuck=False)
-    assert search().converged(rough, ended) == (rough, ended)
-    assert search("newton").converged(rough, stuck) == (rough, stuck)
+    assert search().converged(ROUGH, ended) == (ROUGH, ended)
+    assert search("newton").converged(ROUGH, stuck) == (ROUGH, stuck)
 
 
 def of_segments(samples: int, count: int) -> Any:
@@ -176,11 +193,12 @@ def of_segments(samples: int, count: int) -> Any:
 @pytest.mark.parametrize(
     ("samples", "count", "wanted"),
     [
-        pytest.param(24_800, 25, 6, id="a quarter"),
-        pytest.param(24_800, 4, 4, id="too few segments"),
-        pytest.param(4_000, 100, 100, id="too few samples"),
-        pytest.param(4_000_000, 1000, 10, id="much data"),
+        (24_800, 25, 6),
+        (24_800, 4, 4),
+        (4_000, 100, 100),
+        (4_000_000, 1000, 10),
     ],
+    ids=["a quarter", "too few segments", "too few samples", "much data"],
 )
 def test_a_search_begins_on_a_part_that_is_large_enough(
     samples: int, count: int, wanted: int
@@ -201,39 +219,6 @@ def test_a_part_of_recordings_that_repeat_in_turn_holds_different_ones() -> None
         assert len(set((chosen % 5).tolist())) >= 3
 
 
-@dataclass(frozen=True, kw_only=True)
-class Parts(OneParameter):
-    """Segments of one parameter, some of which have another minimum and diverge beyond a limit.
-
-    Attributes:
-        segments: Minimum of each segment.
-        limit: Parameter from which the segments with the lower minimum diverge.
-    """
-
-    segments: tuple[float, ...]
-    limit: float = np.inf
-    sample_count = 24_800
-    workers = None
-    free_starts = False
-
-    def residuals(self, theta: float) -> Array:
-        """One residual of each segment."""
-        return SLOPE * (theta - np.array(self.segments))
-
-    def cost(self, at: UnknownValues) -> float:
-        """Half of the sum of squares."""
-        diverges = at.theta[0] > self.limit and min(self.segments) < 3.0
-        return np.inf if diverges else super().cost(at)
-
-    def of_segments(self, indices: np.ndarray) -> Parts:
-        """Some segments."""
-        return replace(self, segments=tuple(self.segments[i] for i in indices))
-
-    def of_first_parts(self, share: float) -> Parts:
-        """The same, because there is no initial state."""
-        return self
-
-
 def parts(seen: float, others: float, limit: float = np.inf) -> Parts:
     """25 segments with a minimum of those that the first search sees, and one of the others."""
     minima = np.full(25, others)
@@ -249,10 +234,11 @@ def begin_of(theta: float) -> UnknownValues:
 @pytest.mark.parametrize(
     ("minimum", "limit", "expected"),
     [
-        pytest.param(3.0, np.inf, 3.0, id="the part is like the rest"),
-        pytest.param(1.0, np.inf, 1.1, id="the rest costs more"),
-        pytest.param(2.9, 2.0, 1.1, id="the rest diverges"),
+        (3.0, np.inf, 3.0),
+        (1.0, np.inf, 1.1),
+        (2.9, 2.0, 1.1),
     ],
+    ids=["the part is like the rest", "the rest costs more", "the rest diverges"],
 )
 def test_the_search_over_all_data_begins_where_all_data_cost_less(
     minimum: float, limit: float, expected: float
@@ -267,31 +253,15 @@ def test_the_search_over_all_data_begins_where_all_data_cost_less(
 def test_another_start_is_improved_on_a_part_where_it_beats_the_first_one(
     beaten: float, expected: float | None
 ) -> None:
-    problem: Any = parts(3.0, 2.9)
+    problem = parts(3.0, 2.9)
     found = search().better_start(problem, begin_of(1.1), begin_of(beaten))
     assert (None if found is None else round(float(found.theta[0]), 3)) == expected
 
 
 def test_a_search_that_ends_next_to_divergence_is_kept_where_the_noise_is_estimated() -> None:
     """The first search leads to its minimum, and differences there diverge with other noise."""
-    problem: Any = NoisyParts(segments=(2.5,) * 25)
+    problem = Parts(segments=(2.5,) * 25)
     kept, found = search(noise_is_stated=False).solve(problem, begin_of(1.1))
     assert kept is problem
     assert not found.success and "diverges next to the estimate" in found.status
     assert found.unknowns.theta[0] == pytest.approx(2.5, abs=0.1)
-
-
-class NoisyParts(Parts):
-    """Segments that diverge as soon as their noise changes."""
-
-    noise = SimpleNamespace(sigma=np.ones(1), strides=np.ones(1, dtype=int))
-    value_count = 25
-    unknown_count = 1
-
-    def errors_at(self, at: UnknownValues) -> list[Array]:
-        """Errors of one output."""
-        return [self.residuals(at.theta[0]) + 0.5]
-
-    def with_noise(self, noise: Any) -> Parts:
-        """Segments that diverge."""
-        return replace(self, limit=-np.inf)

@@ -10,11 +10,8 @@ import pytest
 import mjfim
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
-from mjfim.records.estimate import Estimate
 from tests.support.cart_pendulum import logs_of
-from tests.support.numerics import shared_model
-from tests.support.paths import SHARED_MODELS
-from tests.support.shared_models import EXPERIMENTS
+from tests.support.numerics import require_found
 
 # A rotary pendulum for a table top: friction of 1e-3 N m, inertias of 1e-4 kg m².
 FURUTA = """
@@ -52,27 +49,13 @@ STATED: dict[str, Any] = {
 }
 
 
-def complete_fits(experiment: Experiment, count: int = 1) -> list[Estimate]:
-    """Estimates from recordings of the complete model; none has a misfit or a missing term."""
-    found = [mjfim.identify(experiment, [log]) for log in logs_of(experiment, *range(count))]
-    for each in found:
-        assert (each.misfit, each.missing_terms, each.reasons) == (False, (), ())
-        assert each.converged
-    return found
-
-
 @pytest.mark.slow
 def test_a_table_top_furuta_has_no_misfit_with_any_seed(tmp_path: Path) -> None:
     (tmp_path / "furuta.xml").write_text(FURUTA, encoding="utf-8")
     furuta = Experiment(**STATED, directory=tmp_path, source="furuta")
     true = System.resolve(furuta).parameters.true
-    for each in complete_fits(furuta, 3):
-        assert 0.8 < each.chi2 / each.dof < 1.2
-        assert (abs(each.theta - true) < 4.0 * each.std).all()
-
-
-@pytest.mark.slow
-def test_the_furuta_of_another_project_has_no_misfit() -> None:
-    shared_model(EXPERIMENTS["furuta"]["model"])
-    stated = {**EXPERIMENTS["furuta"], "fit": {"bootstrap": 0}}
-    complete_fits(Experiment(**stated, directory=SHARED_MODELS, source="furuta"))
+    for log in logs_of(furuta, 0, 1, 2):
+        found = mjfim.identify(furuta, [log])
+        assert found.missing_terms == ()
+        assert 0.8 < found.chi2 / found.dof < 1.2
+        require_found(found, true)

@@ -65,7 +65,7 @@ def fitted(
         fit={"bootstrap": 0},
     )
     log = mjfim.simulate(experiment, control, 1)
-    found = mjfim.identify(experiment, [log], start=start, progress=False)
+    found = mjfim.identify(experiment, [log], start=start)
     assert found.converged and not found.misfit
     low, high = found.interval.T
     values = list(true.values())
