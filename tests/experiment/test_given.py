@@ -227,7 +227,7 @@ def test_a_wrong_array_is_named(
     given = {name: values for name, values in arrays.items() if values is not ...}
 
     with pytest.raises(MjfimError, match=message):
-        recordings_of(system, given)
+        mjfim.identify(system.experiment, **given, progress=False)
 
 
 def test_an_empty_text_names_no_log(system: System) -> None:

@@ -583,3 +583,12 @@ PROPOSALS: dict[str, tuple[dict[str, Any], str, dict[str, Any]]] = {
 def test_proposals(case: str, tmp_path: Path) -> None:
     columns, actuators, expected = PROPOSALS[case]
     assert proposal(columns, actuators, tmp_path) == expected
+
+
+def test_a_proposal_reads_the_log(read: Read) -> None:
+    """What the message of a log that does not fit proposes, pasted as it is, reads the log."""
+    text, _ = TEXTS["rostopic echo -p"]
+    with pytest.raises(RecordingError, match="column 't' is missing") as refused:
+        read("log.csv", text.encode())
+    pasted = str(refused.value).partition("\n")[2]
+    assert is_whole(read("log.csv", **tomllib.loads(pasted)["recording"]), tolerance=1e-14)
