@@ -37,38 +37,31 @@ def recording(system: System) -> mjfim.Recording:
 
 
 @pytest.mark.parametrize(
-    ("parameters", "names", "targets"),
+    ("parameters", "expected"),
     [
-        (["body/bob:mass"], ["body/bob:mass"], ["body/bob:mass"]),
+        (["body/bob:mass"], {"body/bob:mass": "body/bob:mass"}),
         (
-            ["joint/*:damping", "body/bob:mass"],
-            ["joint/slide:damping", "joint/hinge:damping", "body/bob:mass"],
-            ["joint/slide:damping", "joint/hinge:damping", "body/bob:mass"],
+            ["joint/*:damping", "body/bob:ipos[*]"],
+            {
+                path: path
+                for path in (
+                    "joint/slide:damping",
+                    "joint/hinge:damping",
+                    *(f"body/bob:ipos[{i}]" for i in range(3)),
+                )
+            },
         ),
-        (
-            ["body/bob:ipos[*]"],
-            [f"body/bob:ipos[{i}]" for i in range(3)],
-            [f"body/bob:ipos[{i}]" for i in range(3)],
-        ),
-        ({"m": "body/bob:mass"}, ["m"], ["body/bob:mass"]),
+        ({"m": "body/bob:mass"}, {"m": "body/bob:mass"}),
     ],
 )
 def test_a_path_stands_for_its_table_and_a_star_for_any_text(
-    parameters: Any, names: list[str], targets: list[str]
+    parameters: Any, expected: dict[str, str]
 ) -> None:
     """In a list each match is a parameter with its path as the name."""
-    found = Experiment(**{**STATED, "parameters": parameters})
+    found = Experiment(**{**STATED, "parameters": parameters}).parameters
 
-    assert list(found.parameters) == names
-    paths = [each.path for spec in found.parameters.values() for each in spec.all_targets]
-    assert paths == targets
-
-
-def test_a_guess_is_the_value_of_the_model_where_none_is_stated(system: System) -> None:
-    assert system.parameters.guess.tolist() == [
-        system.model.body("bob").mass[0],
-        system.model.joint("hinge").damping[0],
-    ]
+    assert list(found) == list(expected)
+    assert {name: spec.target for name, spec in found.items()} == expected
 
 
 def test_none_removes_what_is_stated() -> None:
@@ -222,24 +215,24 @@ def test_positions_of_joints_serve_their_sensors(recording: mjfim.Recording) -> 
         ({"qpos": [[1.0], [1.0, 2.0]]}, "'qpos': needs an array of numbers"),
         ({"t": None}, "'t': needs an array of numbers; not None"),
         ({"t": [0.0] * 21}, "t"),
+        ({"t": ...}, "'t' is missing"),
+        ({"ctrl": ...}, "found: t, .*; arrays are called `t`"),
     ],
 )
 def test_a_wrong_array_is_named(
     change: dict[str, Any], message: str, recording: mjfim.Recording, system: System
 ) -> None:
-    arrays = {"t": recording.t, "ctrl": recording.ctrl, "qpos": recording.y[:, :2]}
+    """An array in place of which stands `...` is left out."""
+    arrays = {"t": recording.t, "ctrl": recording.ctrl, "qpos": recording.y[:, :2], **change}
+    given = {name: values for name, values in arrays.items() if values is not ...}
 
-    with pytest.raises(MjfimError) as caught:
-        mjfim.identify(system.experiment, **{**arrays, **change}, progress=False)
+    with pytest.raises(MjfimError, match=message):
+        mjfim.identify(system.experiment, **given, progress=False)
 
-    assert message in str(caught.value)
-    for given, words in (
-        ({"qpos": recording.y[:, :2]}, "'t' is missing"),
-        ({"t": recording.t, "qpos": recording.y[:, :2]}, r"found: t, .*; arrays are called `t`"),
-        ("", '"" names no log'),
-    ):
-        with pytest.raises(MjfimError, match=words):
-            recordings_of(system, given)
+
+def test_an_empty_text_names_no_log(system: System) -> None:
+    with pytest.raises(MjfimError, match='"" names no log'):
+        recordings_of(system, "")
 
 
 def test_each_verb_takes_one_recording_without_a_list(

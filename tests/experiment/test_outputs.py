@@ -13,10 +13,7 @@ from numpy.testing import assert_allclose
 
 from mjfim.errors import ExperimentError
 from mjfim.excitation.task import DesignTask
-from mjfim.experiment.outputs import resolve_outputs
-from mjfim.experiment.schema import Experiment
 from mjfim.model.coordinates import (
-    ModelCoordinates,
     control_names,
     joint_names,
     measurable_columns,
@@ -155,14 +152,9 @@ def square(n: int, value: float = 1.0) -> list[list[float]]:
     return (value * np.eye(n)).tolist()
 
 
-def pair(*names: str, covariance: Any = None) -> list[dict[str, Any]]:
+def pair(*names: str, key: str = "covariance") -> list[dict[str, Any]]:
     """One correlated block."""
-    return [
-        {
-            "outputs": list(names),
-            "covariance": square(len(names)) if covariance is None else covariance,
-        }
-    ]
+    return [{"outputs": list(names), key: square(len(names))}]
 
 
 WRONG: dict[str, tuple[dict[str, Any], str]] = {
@@ -234,7 +226,7 @@ WRONG: dict[str, tuple[dict[str, Any], str]] = {
         r"correlated\.outputs: one of them is already correlated with an output that is not listed",
     ),
     "correlated key": (
-        {"correlated": [{"outputs": ["rate", "angle"], "matrix": square(2)}]},
+        {"correlated": pair("rate", "angle", key="matrix")},
         r"correlated\.0\.matrix: unknown key .*valid: covariance, outputs",
     ),
 }
@@ -262,32 +254,21 @@ def test_another_spelling_of_a_column_is_refused_with_its_name(
         body_task(tmp_path, noise={written: 0.1})
 
 
-def test_a_covariance_of_an_orientation_is_refused(tmp_path: Path) -> None:
+@pytest.mark.parametrize(("key", "size"), [("qpos:ball", 4), ("qpos:float", 7), ("state", 20)])
+def test_a_covariance_of_an_orientation_is_refused(key: str, size: int, tmp_path: Path) -> None:
     """Its four components are one rotation."""
-    for key, size in (("qpos:ball", 4), ("qpos:float", 7), ("state", 20)):
-        with pytest.raises(
-            ExperimentError,
-            match=rf"noise\.{key}: an orientation takes one sigma \[rad\] and no covariance",
-        ):
-            body_task(tmp_path, noise={key: {"covariance": square(size)}})
+    said = rf"noise\.{key}: an orientation takes one sigma \[rad\] and no covariance"
+    with pytest.raises(ExperimentError, match=said):
+        body_task(tmp_path, noise={key: {"covariance": square(size)}})
     found = body_task(tmp_path, noise={"qvel:ball": {"covariance": square(3, 0.25)}})
     assert set(sigmas(found).values()) == {0.5}
 
 
 def test_a_model_without_joints_has_no_state_to_measure(tmp_path: Path) -> None:
-    model = mujoco.MjModel.from_xml_string(
-        '<mujoco><worldbody><site name="s"/></worldbody></mujoco>'
-    )
-    experiment = Experiment(
-        model="x.xml",
-        rate=100.0,
-        horizon=1.0,
-        initial={"control": {"kind": "sine"}},
-        parameters={"m": {"target": "option:gravity[2]"}},
-        noise={"state": 0.1},
-    )
+    xml = '<mujoco><worldbody><site name="s"/></worldbody></mujoco>'
+    tables = {"parameters": {"m": {"target": "option:gravity[2]"}}, "noise": {"state": 0.1}}
     with pytest.raises(ExperimentError, match=r"noise\.state: the model has no joint to measure"):
-        resolve_outputs(experiment, ModelCoordinates.of(model), None, stride=1, stride_of_key={})
+        make_task(xml, tmp_path, **tables)
 
 
 def test_sensors_read_by_the_plant_are_those_of_mujoco(tmp_path: Path) -> None:

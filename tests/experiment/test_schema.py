@@ -12,7 +12,6 @@ from typing import Any, get_args
 
 import numpy as np
 import pytest
-from numpy.testing import assert_allclose
 
 from mjfim.errors import ExperimentError, MjfimError, ModelError, RecordingError
 from mjfim.excitation.task import DesignTask
@@ -219,17 +218,13 @@ def test_extended_contract_parses_and_resolves(resolve: Resolve) -> None:
     assert e.robust == Robust(over="worst", samples=3, seed=4)
     assert (e.descent.starts, e.descent.coarse, e.descent.seed) == (3, 2, 5)
     assert noise.strides.tolist() == [2] * 4 + [1] * 2
-    assert_allclose(noise.sigma, [2.0, 2.0, 1.0, 1.0, 0.02, 0.01])
     assert (noise.covariance[0, 1], noise.covariance[4, 5]) == (1.0, 1e-5)
     deviations = ("initial qpos:slide", "initial qvel:hinge", *(f"bias {n}" for n in outputs))
     bob = [f"bob.{name}" for name in INERTIA_PARAMETRISATIONS["barycentric"].names]
     assert task.parameters.names == (*bob, "c", *deviations, "delay")
-    assert [p.prior for p in task.parameters.parameters[11:13]] == [0.01, None]
-    assert (task.parameters.wanted[10], task.parameters.parameters[-1].prior) == (0.01, 0.005)
+    assert task.parameters.wanted[10] == 0.01
     assert task.parameters.interest.tolist() == [10]
-    assert task.control[0] == pytest.approx(0.5)
     assert Experiment(**e.model_dump(), directory=e.directory, source=e.source) == e
-    assert e.replace(noise={"hinge_angle": 0.3}).noise == {**e.noise, "hinge_angle": 0.3}
 
 
 def test_contract_resolves(resolve: Resolve) -> None:
@@ -263,23 +258,26 @@ def test_mjcf_noise_is_the_default(resolve: Resolve) -> None:
     assert system.noise.sigma.tolist() == [0.05] * 4
 
 
-def test_start_from_qpos(resolve: Resolve) -> None:
-    task = resolve(edited('keyframe = "hanging"', "qpos = [0.5, 3.0]\nqvel = [0.0, -1.0]"))
-    assert task.plant.nominal_initial_state.tolist() == [0.5, 3.0, 0.0, -1.0]
-    task = resolve(edited('keyframe = "hanging"', ""))
-    assert task.plant.nominal_initial_state.tolist() == [0.0] * 4
+@pytest.mark.parametrize(
+    ("stated", "state"),
+    [("qpos = [0.5, 3.0]\nqvel = [0.0, -1.0]", [0.5, 3.0, 0.0, -1.0]), ("", [0.0] * 4)],
+)
+def test_start_from_qpos(stated: str, state: list[float], resolve: Resolve) -> None:
+    task = resolve(edited('keyframe = "hanging"', stated))
+    assert task.plant.nominal_initial_state.tolist() == state
 
 
 def test_replace_merges_and_checks(folder: Path) -> None:
     """Tables merge, other keys and the old experiment stay, and faults are refused as in a file."""
     e = Experiment.from_file(folder / "cart_pendulum.toml")
+    old = e.model_dump()
     new = e.replace(horizon=1.0, cost={"control": 1e-2}, initial={"control": {"kind": "chirp"}})
-    assert (new.horizon, new.cost.control, new.initial.control) == (1.0, 1e-2, Signal(kind="chirp"))
-    assert (new.cost.tracking, new.initial.keyframe) == (e.cost.tracking, "hanging")
-    assert (new.parameters, new.directory, new.source) == (e.parameters, e.directory, e.source)
-    assert (e.horizon, e.cost.control) == (4.0, 1e-3)
-    said = r"cart_pendulum\.toml: cost\.contrl: unknown key .* valid: .*control"
-    with pytest.raises(ExperimentError, match=said):
+    changed = Signal(kind="chirp").model_dump()
+    cost = {**old["cost"], "control": 1e-2}
+    initial = {**old["initial"], "control": changed}
+    assert new.model_dump() == {**old, "horizon": 1.0, "cost": cost, "initial": initial}
+    assert (e.model_dump(), new.directory, new.source) == (old, e.directory, e.source)
+    with pytest.raises(ExperimentError, match=r"cart_pendulum\.toml: cost\.contrl: unknown key"):
         e.replace(cost={"contrl": 1.0})
 
 

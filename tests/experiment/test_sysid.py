@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
 from types import SimpleNamespace
 from typing import Any
 
@@ -39,39 +38,33 @@ def series(t: Any, data: Any, **signals: Any) -> SimpleNamespace:
     return SimpleNamespace(times=t, data=data, signal_mapping=mapping)
 
 
-class Parameter:
+class Parameter(SimpleNamespace):
     """A parameter as sysid has it."""
 
-    def __init__(self, nominal: Any, low: Any, high: Any, modifier: Any = None) -> None:
-        self.value = np.atleast_1d(nominal).astype(float)
-        self.low, self.high = np.atleast_1d(low), np.atleast_1d(high)
-        self.modifier, self.frozen = modifier, False
-
-    @property
-    def size(self) -> int:
-        return self.value.size
+    modifier, frozen = None, False
+    size = property(lambda self: self.value.size)
 
     def as_vector(self) -> np.ndarray:
-        return self.value.flatten()
+        return self.value
 
     def get_bounds(self) -> tuple[np.ndarray, np.ndarray]:
-        return self.low.flatten(), self.high.flatten()
+        return self.low, self.high
 
     def update_from_vector(self, vector: np.ndarray) -> None:
-        self.value = vector.reshape(self.value.shape)
+        self.value = vector
 
 
-@dataclass
-class Parameters:
+def parameter(numbers: list[list[float]], **fields: Any) -> Parameter:
+    """A parameter by the rows value, lower and upper bound."""
+    value, low, high = np.array(numbers)
+    return Parameter(value=value, low=low, high=high, **fields)
+
+
+def dictionary(parameters: dict[str, Parameter]) -> SimpleNamespace:
     """A `ParameterDict`."""
-
-    parameters: dict[str, Parameter] = field(default_factory=dict)
-
-    def items(self) -> Any:
-        return list(self.parameters.items())
-
-    def as_nominal_vector(self) -> np.ndarray:
-        return np.zeros(0)
+    return SimpleNamespace(
+        parameters=parameters, items=parameters.items, as_nominal_vector=lambda: np.zeros(0)
+    )
 
 
 def set_body(spec: Any, parameter: Any) -> None:
@@ -82,11 +75,10 @@ def set_body(spec: Any, parameter: Any) -> None:
 
 def test_modifiers_become_functions_that_edit_as_sysid_does() -> None:
     """All numbers of a parameter come together, as its modifier needs them."""
-    bob = Parameter([1.5, -0.2], [0.1, -1.0], [5.0, 1.0], set_body)
-    damping = Parameter(0.3, 0.0, 2.0)
-    frozen = Parameter(7.0, 0.0, 9.0)
-    frozen.frozen = True
-    given = Parameters({"bob": bob, "joint/hinge:damping": damping, "frozen": frozen})
+    bob = parameter([[1.5, -0.2], [0.1, -1.0], [5.0, 1.0]], modifier=set_body)
+    damping = parameter([[0.3], [0.0], [2.0]])
+    frozen = parameter([[7.0], [0.0], [9.0]], frozen=True)
+    given = dictionary({"bob": bob, "joint/hinge:damping": damping, "frozen": frozen})
 
     experiment = mjfim.Experiment(**{**STATED, "parameters": given})
     system = System.resolve(experiment)
@@ -96,8 +88,7 @@ def test_modifiers_become_functions_that_edit_as_sysid_does() -> None:
     assert system.parameters.upper.tolist() == [5.0, 1.0, 2.0]
     model = system.model_at(np.array([1.2, -0.4, 0.6]))
     spec = mujoco.MjSpec.from_file(str(MODEL))
-    bob.update_from_vector(np.array([1.2, -0.4]))
-    set_body(spec, bob)
+    set_body(spec, SimpleNamespace(value=[1.2, -0.4]))
     wanted = spec.compile()
     assert_allclose(model.body("bob").mass, wanted.body("bob").mass, rtol=1e-12)
     assert_allclose(model.body("bob").ipos, wanted.body("bob").ipos, rtol=1e-12)
@@ -106,7 +97,7 @@ def test_modifiers_become_functions_that_edit_as_sysid_does() -> None:
 
 def test_parameters_without_modifier_change_those_of_an_experiment() -> None:
     changed = mjfim.Experiment(**STATED).replace(
-        parameters=Parameters({"m": Parameter(1.4, 0.5, 3.0)})
+        parameters=dictionary({"m": parameter([[1.4], [0.5], [3.0]])})
     )
 
     spec = changed.parameters["m"]

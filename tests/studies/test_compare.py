@@ -27,7 +27,7 @@ from mjfim.records.events import Event, StudyEvent
 from mjfim.records.studies import DESIGN, Comparison, MethodOutcome, MethodResult
 from mjfim.studies.compare import chosen_methods
 from tests.support.cart_pendulum import cart_pendulum
-from tests.support.cli import MODELS, loads, names, read, run, write_experiment
+from tests.support.cli import MODELS, loads, misused, names, read, run, write_experiment
 from tests.support.limits import excess_of
 from tests.support.made_records import make_comparison, make_method_result
 
@@ -126,12 +126,15 @@ def test_logarithms_are_compared_by_their_difference() -> None:
     assert c.gain(c.rows[1], c.rows[0]) == pytest.approx(1.0 - np.exp(-1.0))
 
 
+def test_a_budget_is_finite() -> None:
+    with pytest.raises(ExperimentError, match="positive"):
+        mjfim.compare(PENDULUM, seconds=np.inf)
+
+
 def test_only_applicable_methods_are_run() -> None:
     hard = DesignTask.resolve(PENDULUM).system
     assert chosen_methods(hard, None)[:2] == ("chirp", "multisine")
     assert chosen_methods(hard, ["steps", "design", "steps"]) == ("steps",)
-    with pytest.raises(ExperimentError, match="did you mean 'chirp'"):
-        chosen_methods(hard, ["chrip"])
 
 
 @pytest.mark.slow
@@ -155,12 +158,6 @@ def test_a_request_to_stop_keeps_finished_methods_and_the_best_of_the_last() -> 
     assert "not run" in c.findings[0]
 
 
-@pytest.mark.parametrize("budget", [{"seconds": 0.0}, {"seconds": np.inf}])
-def test_budgets_must_be_positive(budget: dict[str, float]) -> None:
-    with pytest.raises(ExperimentError, match="positive"):
-        mjfim.compare(PENDULUM, **budget)
-
-
 @pytest.mark.parametrize(
     "rows",
     [
@@ -180,7 +177,8 @@ def test_the_picture_of_any_result_is_drawn(rows: tuple[MethodResult, ...], tmp_
 
 @pytest.mark.slow
 def test_files_table_and_exit_code(study: Path, tmp_path: Path) -> None:
-    out, words = tmp_path / "out", ("compare", study, "-o", tmp_path / "out", "--seconds", 2)
+    out = tmp_path / "out"
+    words = ("compare", study, "-o", out, "--seconds", 2)
     with measured_by(time.process_time):
         result = run(*words, "--methods", "chirp,steps", "--json")
         controls = {f"control_{name}.csv" for name in ("chirp", "steps", DESIGN)}
@@ -194,17 +192,14 @@ def test_files_table_and_exit_code(study: Path, tmp_path: Path) -> None:
     assert told["budget"] == {"seconds": 2.0}
     assert all(len(m["std"]) == 3 and m["limits"]["margins"] for m in told["methods"])
     assert names(out) == controls - {"control_steps.csv"} | further
-    for word in ("mjfim's design", "worst σ", "σ of each parameter", "m (kg)", "The design is"):
-        assert word in " ".join(again.stdout.split())
+    assert "The design is" in " ".join(again.stdout.split())
     assert "…" not in again.stdout  # every number whole
 
     # A control of it is the initial control of another experiment.
     control = {"control": str(out / "control_chirp.csv"), "keyframe": "hanging"}
     stated = mjfim.Experiment.from_file(study).replace(initial=control)
     task = DesignTask.resolve(stated)
-    (reached,) = [
-        m["cost"] for m in read(out / "compare.json")["methods"] if m["method"] == "chirp"
-    ]
+    reached = read(out / "compare.json")["methods"][0]["cost"]
     assert task.problem.point(task.initial).cost == pytest.approx(reached, rel=1e-6)
 
 
@@ -220,21 +215,19 @@ def test_a_design_that_is_beaten_is_no_success(
     assert (told["ok"], told["best"], told["beating"]) == (False, "chirp", ["chirp"])
 
 
-def test_misuse(study: Path, tmp_path: Path) -> None:
-    for words, said in (
-        ((tmp_path / "no.toml", "-o", tmp_path / "o"), "no.toml"),
-        ((study, "-o", tmp_path / "o", "--methods", "chirp,sweep"), "unknown method 'sweep'"),
-        ((study, "-o", tmp_path / "o", "--methods", " , "), "no baseline is named"),
-        ((study, "-o", tmp_path / "o", "--methods", "design"), "no baseline is named"),
-        ((study, "-o", tmp_path / "o", "--seconds", 0), "positive"),
-        ((study, "-o", study), study.name),
-        ((study,), "--output"),
-    ):
-        result = run("compare", *words)
-        assert result.exit_code == 2, words
-        assert said in result.stderr
-        assert "Traceback" not in result.stderr
-    assert not (tmp_path / "o").exists()
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("--methods", "chirp,chrip"), "did you mean 'chirp'"),
+        (("--methods", " , "), "no baseline is named"),
+        (("--methods", "design"), "no baseline is named"),
+        (("--seconds", 0), "positive"),
+    ],
+)
+def test_misuse(words: tuple[object, ...], said: str, study: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    misused(run("compare", study, "-o", out, *words), said)
+    assert not out.exists()
 
 
 @pytest.mark.slow

@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from mjfim.errors import ExperimentError, ModelError
+from mjfim.errors import ExperimentError
 from mjfim.excitation.limits.verification import verify
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
@@ -26,7 +26,6 @@ from mjfim.studies.first_motion import (
     _candidates,
     _rate,
     choose_start,
-    reach,
     require_support,
     time_scale,
 )
@@ -244,7 +243,10 @@ def test_proposals_scale_with_the_size_of_the_robot(
     other, _ = proposed(pendulum(tmp_path, length=length, mass=mass), tmp_path)
 
     assert other.times.samples == pytest.approx(small.times.samples, rel=0.6)
-    assert other.times.period / small.times.period == pytest.approx(np.sqrt(length), rel=1e-3)
+    for found, size in ((small, 1.0), (other, length)):
+        times, period = found.times, 2 * np.pi * np.sqrt(size / 9.81)
+        assert times.period == pytest.approx(period, rel=1e-3)
+        assert times.samples == pytest.approx(times.horizon * times.rate)
     ratio = other.amplitudes["motor"] / small.amplitudes["motor"]
     assert ratio == pytest.approx(mass * length, rel=0.1)
     assert [each.name for each in other.chosen] == [each.name for each in small.chosen]
@@ -415,25 +417,18 @@ def test_what_equal_joints_lack_has_the_size_of_the_strongest(strong: str, force
         assert len(found[name].paths) == 4
 
 
-def test_faults_are_named(tmp_path: Path) -> None:
-    with pytest.raises(ExperimentError, match="payload: unknown body 'hand'"):
-        propose_experiment(MODELS / "cart_pendulum.xml", tmp_path, Wishes(payload="hand"))
-    with pytest.raises(ExperimentError, match="no parameter of motors can be proposed"):
-        propose_experiment(MODELS / "cart_pendulum.xml", tmp_path, Wishes(groups=("motors",)))
-
+def test_robots_that_cannot_be_moved_are_named(tmp_path: Path) -> None:
     with pytest.raises(ExperimentError, match=r"neither an actuator nor a slide, hinge or ball"):
         propose_experiment(written(tmp_path, FREE_BODY), tmp_path)
-    with pytest.raises(ModelError, match="no such model file"):
-        propose_experiment(tmp_path / "absent.xml", tmp_path)
 
     # A robot with legs whose file has no floor falls.
     legged = written(tmp_path, WALKER.format(floor=""))
     with pytest.raises(ExperimentError, match=r'nothing is below trunk, .* <geom type="plane"'):
         propose_experiment(legged, tmp_path)
     weightless = WALKER.format(floor="").replace("<mujoco>", '<mujoco><option gravity="0 0 0"/>')
-    require_support(mujoco.MjModel.from_xml_string(weightless), legged)
     on_floor = WALKER.format(floor='<geom type="plane" size="0 0 1"/>')
-    require_support(mujoco.MjModel.from_xml_string(on_floor), legged)
+    for text in (weightless, on_floor):
+        require_support(mujoco.MjModel.from_xml_string(text), legged)
 
 
 WALKER = """
@@ -531,47 +526,46 @@ def test_joints_that_tendons_drive_have_limits_of_their_speed(tmp_path: Path) ->
     assert verify(task, task.initial).is_feasible
 
 
-def test_the_start_is_a_keyframe_that_a_control_holds_or_a_state_inside_the_ranges() -> None:
-    model = mujoco.MjModel.from_xml_path(str(MODELS / "servo_arm.xml"))
-    start = choose_start(model)
-    assert start.keyframe in ("home", "settled")
-    assert start.held
+UPRIGHT = """
+<mujoco>
+  <worldbody><body name="rod"><joint name="hinge" axis="0 1 0" damping="0.1"/>
+  <geom type="capsule" fromto="0 0 0 0 0 0.5" size="0.02" mass="1"/></body></worldbody>
+  <actuator><motor joint="hinge" ctrlrange="-9 9"/></actuator>
+  {keyframe}
+</mujoco>
+"""
 
-    # Reference positions outside of the ranges are moved inside.
-    text = """
+# The name of a keyframe, the end of the reason for the start, lower and upper ends of its position,
+# and an MJCF.
+STARTS: dict[str, tuple[str, str, list[float], list[float], str]] = {
+    "reference outside of the range": (
+        "",
+        "",
+        [np.deg2rad(60.0)],
+        [np.deg2rad(120.0)],
+        """
     <mujoco>
-      <worldbody><body name="b"><joint name="j" axis="0 0 1" range="1 2" limited="true"/>
+      <worldbody><body name="b"><joint name="j" axis="0 0 1" range="60 120" limited="true"/>
       <geom size="0.1" mass="1" pos="0.3 0 0"/></body></worldbody>
       <actuator><motor joint="j"/></actuator>
     </mujoco>
-    """
-    start = choose_start(
-        mujoco.MjModel.from_xml_string(text.replace('range="1 2"', 'range="60 120"'))
-    )
-    assert np.deg2rad(60.0) < start.qpos[0] < np.deg2rad(120.0)
-
-
-def test_a_pendulum_begins_hanging_where_the_file_shows_it_upright() -> None:
-    """A keyframe is what the user wants, also one that is not stable."""
-    text = """
-    <mujoco>
-      <worldbody><body name="rod"><joint name="hinge" axis="0 1 0" damping="0.1"/>
-      <geom type="capsule" fromto="0 0 0 0 0 0.5" size="0.02" mass="1"/></body></worldbody>
-      <actuator><motor joint="hinge" ctrlrange="-9 9"/></actuator>
-      {keyframe}
-    </mujoco>
-    """
-    start = choose_start(mujoco.MjModel.from_xml_string(text.format(keyframe="")))
-    assert start.held
-    assert np.cos(start.qpos[0]) == pytest.approx(-1.0, abs=1e-6)
-    up = '<keyframe><key name="up" qpos="0"/></keyframe>'
-    start = choose_start(mujoco.MjModel.from_xml_string(text.format(keyframe=up)))
-    assert start.keyframe == "up"
-
-
-def test_a_keyframe_that_no_control_holds_is_where_a_robot_settles() -> None:
-    """A passive finger falls, while the driven arm stays where the keyframe shows it."""
-    model = mujoco.MjModel.from_xml_string("""
+    """,
+    ),
+    "upright is shown": ("", "", [np.pi - 1e-3], [np.pi + 1e-3], UPRIGHT.format(keyframe="")),
+    "upright is a keyframe": (
+        "up",
+        "",
+        [0.0],
+        [0.0],
+        UPRIGHT.format(keyframe='<keyframe><key name="up" qpos="0"/></keyframe>'),
+    ),
+    # A passive finger falls, while the driven arm stays where the keyframe shows it.
+    "keyframe that no control holds": (
+        "",
+        "from the keyframe 'home' of the MJCF",
+        [0.8 - 1e-6, -0.8 - 1e-4],
+        [0.8 + 1e-6, -0.8 + 1e-4],
+        """
     <mujoco>
       <compiler angle="radian"/>
       <worldbody><body name="arm"><joint name="arm" axis="0 1 0"/>
@@ -582,12 +576,96 @@ def test_a_keyframe_that_no_control_holds_is_where_a_robot_settles() -> None:
       <actuator><position joint="arm" kp="500" kv="20"/></actuator>
       <keyframe><key name="home" qpos="0.8 0.5" ctrl="0.8"/></keyframe>
     </mujoco>
-    """)
-    start = choose_start(model)
+    """,
+    ),
+    # The body floats 1 m above the floor; it settles on it.
+    "nothing holds the robot": (
+        "",
+        "",
+        [-np.inf] * 8,
+        [np.inf, np.inf, 0.2, *[np.inf] * 5],
+        """
+    <mujoco>
+      <worldbody><geom type="plane" size="5 5 1"/>
+        <body name="b" pos="0 0 1"><freejoint/><geom type="box" size="0.1 0.1 0.1" mass="1"/>
+        <body pos="0 0 0.1"><joint name="j" axis="0 1 0"/>
+        <geom size="0.05" mass="0.1" pos="0 0 0.1"/></body></body></worldbody>
+      <actuator><motor joint="j" ctrlrange="-1 1"/></actuator>
+    </mujoco>
+    """,
+    ),
+    # The weak motor cannot hold the arm, which falls on the end of its range.
+    "rest on a stop": (
+        "",
+        "",
+        [-np.deg2rad(59.0)],
+        [np.deg2rad(59.0)],
+        """
+    <mujoco>
+      <worldbody><body name="arm"><joint name="j" axis="0 1 0" range="-60 60" limited="true"/>
+      <geom size="0.05" mass="1" pos="0.5 0 0"/></body></worldbody>
+      <actuator><motor joint="j" ctrlrange="-0.01 0.01"/></actuator>
+    </mujoco>
+    """,
+    ),
+}
+
+
+@pytest.mark.parametrize(("keyframe", "reason", "low", "high", "text"), STARTS.values(), ids=STARTS)
+def test_a_start_is_held_inside_the_ranges_or_drifts_least(
+    keyframe: str, reason: str, low: list[float], high: list[float], text: str
+) -> None:
+    """A keyframe is what the user wants, also one that is not stable."""
+    start = choose_start(mujoco.MjModel.from_xml_string(text))
+    assert (start.keyframe or "") == keyframe
+    assert start.reason.endswith(reason)
+    assert (low <= start.qpos).all() and (start.qpos <= high).all()
+
+
+HELD = """
+<mujoco>
+  <option timestep="{timestep}"/>
+  <worldbody>
+    <body name="arm" gravcomp="{gravcomp}">
+      <joint name="hinge" axis="0 1 0" ref="20" springref="0"/>
+      <geom size="{radius}" mass="{mass}" pos="{length} 0 0"/>
+    </body>
+  </worldbody>
+  <actuator><{actuator}/></actuator>
+</mujoco>
+"""
+SERVO = 'position joint="hinge" kp="9"'
+
+
+@pytest.mark.parametrize(
+    ("actuator", "length", "mass", "gravcomp", "control", "act"),
+    [
+        *(
+            ('motor joint="hinge"', length, mass, 0.0, -9.81 * mass * length, [])
+            for length, mass in ((1e-3, 1e-6), (1.0, 1.0), (1e3, 1e6))
+        ),
+        (SERVO, 1.0, 1.0, 1.0, np.deg2rad(20.0), []),
+        (f'{SERVO} gear="2"', 1.0, 1.0, 1.0, np.deg2rad(40.0), []),
+        # The control of an integrated servo is a velocity, and its activation is the position.
+        ('intvelocity joint="hinge" kp="9" actrange="-9 9"', 1.0, 1.0, 1.0, 0.0, [np.deg2rad(20)]),
+    ],
+)
+def test_actuators_hold_arms_of_every_size_where_they_are(
+    actuator: str, length: float, mass: float, gravcomp: float, control: float, act: list[float]
+) -> None:
+    """A motor by its torque, a servo by the place of its joint."""
+    text = HELD.format(
+        timestep=0.002 * np.sqrt(length),
+        radius=0.1 * length,
+        mass=mass,
+        length=length,
+        gravcomp=gravcomp,
+        actuator=actuator,
+    )
+    start = choose_start(mujoco.MjModel.from_xml_string(text))
     assert start.held
-    assert start.qpos[0] == pytest.approx(0.8, abs=1e-6)
-    assert start.qpos.sum() == pytest.approx(0.0, abs=1e-4)
-    assert start.reason.endswith("from the keyframe 'home' of the MJCF")
+    assert start.control == pytest.approx([control], rel=1e-3)
+    assert start.act == pytest.approx(act)
 
 
 def test_what_the_file_says_about_starts_and_names(tmp_path: Path) -> None:
@@ -616,16 +694,6 @@ def test_what_the_file_says_about_starts_and_names(tmp_path: Path) -> None:
     assert "m, weak at the end of the range" in warning
 
 
-def test_length_and_period_are_those_of_a_pendulum(tmp_path: Path) -> None:
-    model = mujoco.MjModel.from_xml_path(str(pendulum(tmp_path, length=0.5, mass=2.0)))
-    data = mujoco.MjData(model)
-    mujoco.mj_forward(model, data)
-    assert reach(model, data) == pytest.approx(0.5)
-    times = time_scale(model, data)
-    assert times.period == pytest.approx(2 * np.pi * np.sqrt(0.5 / 9.81))
-    assert times.samples == pytest.approx(times.horizon * times.rate)
-
-
 def test_parameters_are_chosen_until_one_spoils_the_others() -> None:
     # The second parameter has the same effect as the first one; the third is separate.
     G = np.array([[1.0, 1.0, 0.0], [1.0, 1.0, 1.0], [0.0, 0.0, 2.0]]) * 10.0
@@ -639,53 +707,6 @@ def test_parameters_are_chosen_until_one_spoils_the_others() -> None:
 
     # Where nothing is known well, the best known parameter remains.
     assert identifiable(1e-6 * np.diag([1.0, 3.0, 2.0]), sizes) == [1]
-
-
-ARM = """
-<mujoco>
-  <option timestep="{timestep}"/>
-  <worldbody>
-    <body name="arm" gravcomp="{gravcomp}">
-      <joint name="hinge" axis="0 1 0" ref="20" springref="0"/>
-      <geom size="{radius}" mass="{mass}" pos="{length} 0 0"/>
-    </body>
-  </worldbody>
-  <actuator>{actuator}</actuator>
-</mujoco>
-"""
-
-
-def arm(actuator: str, *, size: float = 1.0, mass: float = 1.0, gravcomp: float = 0.0) -> object:
-    """A horizontal arm of some length [m] and mass [kg]."""
-    text = ARM.format(
-        timestep=0.002 * np.sqrt(size),
-        radius=0.1 * size,
-        mass=mass,
-        length=size,
-        gravcomp=gravcomp,
-        actuator=actuator,
-    )
-    return mujoco.MjModel.from_xml_string(text)
-
-
-@pytest.mark.parametrize(("size", "mass"), [(1e-3, 1e-6), (1.0, 1.0), (1e3, 1e6)])
-def test_a_motor_holds_arms_of_every_size(size: float, mass: float) -> None:
-    start = choose_start(arm('<motor joint="hinge"/>', size=size, mass=mass))
-    assert start.held
-    assert start.control == pytest.approx([-9.81 * mass * size], rel=1e-3)
-
-
-def test_a_servo_is_commanded_to_where_its_joint_is() -> None:
-    position = np.deg2rad(20.0)
-    start = choose_start(arm('<position joint="hinge" kp="9"/>', gravcomp=1.0))
-    assert start.control == pytest.approx([position])
-    start = choose_start(arm('<position joint="hinge" kp="9" gear="2"/>', gravcomp=1.0))
-    assert start.control == pytest.approx([2.0 * position])
-
-    # The control of an integrated servo is a velocity, and its activation is the position.
-    start = choose_start(arm('<intvelocity joint="hinge" kp="9" actrange="-9 9"/>', gravcomp=1.0))
-    assert start.control == pytest.approx([0.0])
-    assert start.act == pytest.approx([position])
 
 
 def test_controls_of_an_actuator_with_several_are_told_apart(tmp_path: Path) -> None:
@@ -710,20 +731,6 @@ def test_controls_of_an_actuator_with_several_are_told_apart(tmp_path: Path) -> 
     assert list(proposal.amplitudes) == ["turn[0]", "turn[1]", "turn[2]", "elbow"]
 
 
-def test_a_robot_that_nothing_holds_begins_where_it_drifts_least() -> None:
-    # The body floats 1 m above the floor; it settles on it.
-    model = mujoco.MjModel.from_xml_string("""
-    <mujoco>
-      <worldbody><geom type="plane" size="5 5 1"/>
-        <body name="b" pos="0 0 1"><freejoint/><geom type="box" size="0.1 0.1 0.1" mass="1"/>
-        <body pos="0 0 0.1"><joint name="j" axis="0 1 0"/>
-        <geom size="0.05" mass="0.1" pos="0 0 0.1"/></body></body></worldbody>
-      <actuator><motor joint="j" ctrlrange="-1 1"/></actuator>
-    </mujoco>
-    """)
-    assert choose_start(model).qpos[2] < 0.2
-
-
 def test_rates_are_near_the_wanted_ones_and_slow_drifts_do_not_take_hours() -> None:
     for wanted, timestep in ((97.0, 0.002), (320.0, 0.002), (33.0, 0.005)):
         model = mujoco.MjModel.from_xml_string(
@@ -734,18 +741,6 @@ def test_rates_are_near_the_wanted_ones_and_slow_drifts_do_not_take_hours() -> N
         assert RATE_RANGE**-1 <= _rate(timestep, wanted) / wanted <= RATE_RANGE
         times = time_scale(model, mujoco.MjData(model))
         assert times.horizon <= 10.0 * 1000 * timestep
-
-
-def test_a_start_that_rests_on_a_stop_is_moved_away_from_it() -> None:
-    # The weak motor cannot hold the arm, which falls on the end of its range.
-    model = mujoco.MjModel.from_xml_string("""
-    <mujoco>
-      <worldbody><body name="arm"><joint name="j" axis="0 1 0" range="-60 60" limited="true"/>
-      <geom size="0.05" mass="1" pos="0.5 0 0"/></body></worldbody>
-      <actuator><motor joint="j" ctrlrange="-0.01 0.01"/></actuator>
-    </mujoco>
-    """)
-    assert np.abs(choose_start(model).qpos).max() < np.deg2rad(59.0)
 
 
 def test_the_driven_joints_of_a_robot_on_the_floor_may_stay_where_they_are() -> None:
@@ -840,6 +835,7 @@ def test_wishes_are_fulfilled(tmp_path: Path) -> None:
         ),
         ({"rate": 333.0}, "rates nearby: 50, 100$"),
         ({"horizon": 0.01, "rate": 100.0}, "less than two samples at 100 Hz.* at least 0.02 s"),
+        ({"groups": ("motors",)}, "no parameter of motors can be proposed"),
     ],
 )
 def test_wishes_that_cannot_be_fulfilled_are_named(

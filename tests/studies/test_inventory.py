@@ -10,7 +10,6 @@ import mujoco
 import numpy as np
 import pytest
 
-from mjfim.errors import ModelError
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
 from mjfim.records.inventory import KINDS
@@ -91,11 +90,6 @@ def test_selections_keep_what_is_wanted() -> None:
     for kind in KINDS:
         only = inventory.only(kind)
         assert only.count == len(getattr(inventory, kind))
-
-
-def test_a_missing_model_is_named(tmp_path: Path) -> None:
-    with pytest.raises(ModelError, match=r"absent\.xml: no such model file"):
-        list_model(tmp_path / "absent.xml")
 
 
 def test_the_work_of_a_list_is_proportional_to_the_tendons(tmp_path: Path) -> None:

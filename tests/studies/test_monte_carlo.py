@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal, assert_array_less
 
 import mjfim
-from mjfim.errors import ExperimentError, UnidentifiableError
+from mjfim.errors import ExperimentError, MjfimError, UnidentifiableError
 from mjfim.excitation.task import DesignTask
-from mjfim.experiment.schema import Experiment
 from mjfim.identification.identify import identify
 from mjfim.parallel.budget import StopToken
 from mjfim.records.events import StudyEvent
@@ -21,39 +22,28 @@ from tests.support.cart_pendulum import cart_pendulum
 PAPER_BOUND = np.array([1.04e-3, 2.26e-3, 4.57e-2])
 
 
-@pytest.fixture(scope="module")
-def experiment() -> Experiment:
-    stated = cart_pendulum()
-    return stated.replace(rehearsal={"robots": 4})
+EXPERIMENT = cart_pendulum(rehearsal={"robots": 4})
 
 
 @pytest.fixture(scope="module")
-def design(experiment: Experiment) -> mjfim.Design:
-    return mjfim.design(experiment)
+def design() -> mjfim.Design:
+    return mjfim.design(EXPERIMENT)
+
+
+# The experiment over one second.
+SHORT = EXPERIMENT.replace(horizon=1.0)
 
 
 @pytest.fixture(scope="module")
-def curve(experiment: Experiment) -> Trajectory:
-    """The initial trajectory."""
-    return DesignTask.resolve(experiment).initial
-
-
-@pytest.fixture(scope="module")
-def short(experiment: Experiment) -> Experiment:
-    """The experiment over one second."""
-    return experiment.replace(horizon=1.0)
-
-
-@pytest.fixture(scope="module")
-def motion(short: Experiment) -> Trajectory:
+def motion() -> Trajectory:
     """The initial trajectory of the short experiment."""
-    return DesignTask.resolve(short).initial
+    return DesignTask.resolve(SHORT).initial
 
 
 @pytest.mark.slow
-def test_study_of_the_paper_at_25_hz(experiment: Experiment, design: mjfim.Design) -> None:
+def test_study_of_the_paper_at_25_hz(design: mjfim.Design) -> None:
     curves = {"initial": design.initial.trajectory, "final": design.trajectory}
-    study = monte_carlo(experiment, curves, trials=60, seed=0, measure_rate=25.0)
+    study = monte_carlo(EXPERIMENT, curves, trials=60, seed=0, measure_rate=25.0)
     for s in study.sets.values():
         assert (s.failed, s.trials) == (0, 60)
         # Two standard deviations of a variance of 60 values, sqrt(2 / 60).
@@ -64,9 +54,9 @@ def test_study_of_the_paper_at_25_hz(experiment: Experiment, design: mjfim.Desig
     assert_allclose(study.information["initial"][0, 0], 961, rtol=0.01)
 
 
-def test_the_seed_determines_the_result(short: Experiment, motion: Trajectory) -> None:
+def test_the_seed_determines_the_result(motion: Trajectory) -> None:
     runs = [
-        monte_carlo(short, motion, trials=3, seed=seed).sets["final"].estimates
+        monte_carlo(SHORT, motion, trials=3, seed=seed).sets["final"].estimates
         for seed in (1, 1, 2)
     ]
     assert_array_equal(runs[0], runs[1])
@@ -107,17 +97,17 @@ VARIED = {
 
 @pytest.mark.slow
 def test_trials_with_correlated_noise_rates_and_nuisance_are_least_squares_estimates(
-    experiment: Experiment, design: mjfim.Design
+    design: mjfim.Design,
 ) -> None:
     nuisance = {"bias": {"qpos:slide": 0.05}, "delay": 0.01}
-    task = DesignTask.resolve(experiment.replace(**VARIED, nuisance=nuisance))
+    task = DesignTask.resolve(EXPERIMENT.replace(**VARIED, nuisance=nuisance))
     ctrl, noise = design.trajectory.ctrl, task.system.noise
     found = monte_carlo(task.experiment, design.trajectory, trials=6, seed=5).sets["final"]
     exact, _ = task.plant.measure(task.parameters.true[None], ctrl)
     mask = noise.measured(400) > 0
     white = np.random.default_rng(5).spawn(1)[0].standard_normal((6, mask.sum()))
     std = np.sqrt(np.diag(found.crlb))
-    free = experiment.replace(**VARIED, nuisance={"bias": {"qpos:slide": True}, "delay": True})
+    free = EXPERIMENT.replace(**VARIED, nuisance={"bias": {"qpos:slide": True}, "delay": True})
     for i in range(3):
         z = np.zeros(mask.shape)
         z[mask] = white[i]
@@ -128,28 +118,39 @@ def test_trials_with_correlated_noise_rates_and_nuisance_are_least_squares_estim
         assert_allclose(alone.std, std, rtol=0.2)
 
 
-def test_too_few_trials_are_refused(experiment: Experiment, curve: Trajectory) -> None:
-    with pytest.raises(ExperimentError, match="at least 2"):
-        monte_carlo(experiment, curve, trials=1)
-
-
-def test_a_parameter_that_only_its_prior_determines_is_named(
-    curve: Trajectory, experiment: Experiment
+@pytest.mark.parametrize(
+    ("parameters", "trials", "error", "said"),
+    [
+        ({}, 1, ExperimentError, "at least 2"),
+        (
+            {"blind": {"target": "body/cart:inertia[0]", "guess": 0.01, "prior": 1e-4}},
+            4,
+            UnidentifiableError,
+            "blind: no effect",
+        ),
+    ],
+)
+def test_faults_are_named(
+    parameters: dict[str, Any],
+    trials: int,
+    error: type[MjfimError],
+    said: str,
+    motion: Trajectory,
 ) -> None:
-    blind = {"target": "body/cart:inertia[0]", "guess": 0.01, "prior": 1e-4}
-    with pytest.raises(UnidentifiableError, match="blind: no effect"):
-        monte_carlo(experiment.replace(parameters={"blind": blind}), curve, trials=4)
+    """Too few trials, and a parameter that only its prior determines."""
+    with pytest.raises(error, match=said):
+        monte_carlo(SHORT.replace(parameters=parameters), motion, trials=trials)
 
 
-def test_priors_do_not_enter_the_study(short: Experiment, motion: Trajectory) -> None:
-    sure = short.replace(parameters={"m": {"prior": 1e-6}})
-    plain, prior = (monte_carlo(e, motion, trials=3, seed=1) for e in (short, sure))
+def test_priors_do_not_enter_the_study(motion: Trajectory) -> None:
+    sure = SHORT.replace(parameters={"m": {"prior": 1e-6}})
+    plain, prior = (monte_carlo(e, motion, trials=3, seed=1) for e in (SHORT, sure))
     (found, expected) = (study.sets["final"] for study in (prior, plain))
     assert_allclose(found.estimates, expected.estimates, rtol=1e-9)
     assert_allclose(np.linalg.inv(prior.information["final"]), found.crlb)
 
 
-def test_a_request_to_stop_keeps_the_finished_sets(short: Experiment, motion: Trajectory) -> None:
+def test_a_request_to_stop_keeps_the_finished_sets(motion: Trajectory) -> None:
     curves = {"initial": motion, "final": motion}
     token = StopToken()
     events = []
@@ -158,6 +159,6 @@ def test_a_request_to_stop_keeps_the_finished_sets(short: Experiment, motion: Tr
         events.append((event.part, event.index, event.count, event.share))
         token.request()
 
-    study = monte_carlo(short, curves, trials=6, callback=stop_after_the_first_set, stop=token)
+    study = monte_carlo(SHORT, curves, trials=6, callback=stop_after_the_first_set, stop=token)
     assert set(study.sets) == {"initial"}
     assert events == [("initial", 0, 2, 1.0)]

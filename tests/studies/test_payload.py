@@ -82,14 +82,6 @@ def log(stated: mjfim.Experiment, seed: int) -> mjfim.Recording:
     return mjfim.simulate(stated, trajectory, seed=seed)
 
 
-def with_whole_links(stated: mjfim.Experiment) -> mjfim.Experiment:
-    """The arm with unknown inertias of both links in place of the mass of the hand."""
-    values = stated.model_dump(exclude_unset=True)
-    parameters = {k: v for k, v in values["parameters"].items() if k != "hand_mass"}
-    links = {name: {"inertial": name} for name in ("upper", "hand")}
-    return stated.restated({**values, "parameters": {**parameters, **links}})
-
-
 def inside(found: mjfim.Estimate) -> Array:
     """Whether the true values of the load, in the order of `LOAD`, are inside the intervals."""
     intervals = np.array([found.payload.mass_interval, *found.payload.centre_interval])
@@ -120,11 +112,8 @@ def test_an_earlier_estimate_is_prior_knowledge_with_its_covariance(tmp_path: Pa
     other = replace(estimate, parameters=("pitch_damping", "roll_damping", "mass"))
     for options, message in (
         ({"body": "hand", "robot": other}, "lacks the robot's hand_mass of arm.toml"),
-        ({"body": "hnad"}, "^body: .*did you mean 'hand'"),
-        ({"body": "world"}, "^body: .*move"),
         ({"body": "stand"}, "^body: .*move"),
         ({}, "valid: upper, hand$"),
-        ({"body": "hand", "size": -1.0}, "^size: -1"),
     ):
         with pytest.raises(ExperimentError, match=message):
             PayloadTask.of(robot, **options)
@@ -145,24 +134,15 @@ def test_a_payload_that_the_experiment_states_is_left_out_of_the_robot(tmp_path:
         RobotExperiment.of(stated.replace(parameters={"both": mixed}))
 
 
-def test_a_whole_inertia_of_the_robot_becomes_ten_known_parameters(tmp_path: Path) -> None:
-    values = experiment(tmp_path).model_dump(exclude_unset=True)
-    values["parameters"] = {"hand": {"inertial": "hand"}}
-    whole = experiment(tmp_path).restated(values)
-    system = System.resolve(whole)
-    names, theta = system.parameters.names, system.parameters.guess
-    tables = RobotExperiment.of(whole).known(dict(zip(names, theta, strict=True)))
-    again = System.resolve(whole.restated({**values, "parameters": tables}))
-    assert again.parameters.names == names
-    for vector in (theta, theta + 0.1 * system.parameters.magnitude):
-        expected, found = system.model_at(vector), again.model_at(vector)
-        assert_allclose(found.body_mass, expected.body_mass, rtol=1e-12)
-        assert_allclose(found.body_inertia, expected.body_inertia, rtol=1e-9)
-
-
 def test_a_prior_from_the_model_counts_once(tmp_path: Path) -> None:
-    """The covariance of the earlier estimate contains it, with all correlations."""
-    whole = with_whole_links(experiment(tmp_path))
+    """The covariance of the earlier estimate contains it, with all correlations.
+
+    Whole inertias of the robot become ten known parameters each.
+    """
+    values = experiment(tmp_path).model_dump(exclude_unset=True)
+    values["parameters"] = {name: {"inertial": name} for name in ("upper", "hand")}
+    values["parameters"]["damping"] = {"target": "joint/pitch:damping"}
+    whole = experiment(tmp_path).restated(values)
     system = System.resolve(whole)
     parameters = system.parameters
     cad = CadPrior.of(parameters)
@@ -174,8 +154,8 @@ def test_a_prior_from_the_model_counts_once(tmp_path: Path) -> None:
     covariance = np.linalg.inv(data + cad.information(parameters.guess))
     estimate = estimated(system, covariance, data=data, honest_covariance=covariance)
 
-    task = PayloadTask.of(whole, body="hand", robot=estimate)
-    found = task.system().parameters
+    loaded = PayloadTask.of(whole, body="hand", robot=estimate).system()
+    found = loaded.parameters
     index = [found.names.index(name) for name in parameters.names]
     prior = found.prior_information + CadPrior.of(found).information(found.guess)
     inverse = np.linalg.inv(covariance)
@@ -183,18 +163,30 @@ def test_a_prior_from_the_model_counts_once(tmp_path: Path) -> None:
     assert_allclose(prior[np.ix_(index, index)] / size, inverse / size, atol=1e-5)
     assert not CadPrior.of(found).bodies
 
+    # The numbers of the link without the load mean the same in both models.
+    theta, moved = np.array(found.guess), parameters.guess + 0.1 * parameters.magnitude
+    theta[index] = moved
+    link, expected = (
+        each.body("upper") for each in (loaded.model_at(theta), system.model_at(moved))
+    )
+    assert_allclose(link.mass, expected.mass, rtol=1e-12)
+    assert_allclose(link.inertia, expected.inertia, rtol=1e-9)
+
 
 @pytest.mark.slow
 def test_true_values_are_inside_the_intervals(tmp_path: Path) -> None:
-    robot, loaded = experiment(tmp_path), experiment(tmp_path, **LOAD, inertia=INERTIA)
+    """Also that of an inertia which the recordings show."""
+    robot, loaded = experiment(tmp_path), experiment(tmp_path, **LOAD, inertia=0.02)
     found = []
     for seed in range(5):
         robots = mjfim.identify(robot, [log(robot, seed)])
         estimate = mjfim.identify_payload(
             robot, [log(loaded, 100 + seed)], body="hand", robot=robots
         )
-        assert estimate.converged and estimate.payload.is_seen
-        found.append(inside(estimate))
+        payload = estimate.payload
+        assert estimate.converged and payload.is_seen and payload.edge is None
+        low, high = payload.inertia_interval
+        found.append([*inside(estimate), low <= 0.02 <= high])
     assert np.mean(found) >= 0.85
     assert (np.mean(found, axis=0) >= 0.6).all()
 
@@ -218,19 +210,6 @@ def test_recordings_without_the_payload_take_the_place_of_an_estimate(tmp_path: 
     nothing = mjfim.identify_payload(robot, [log(robot, 3)], body="hand", robot=earlier)
     assert not nothing.payload.is_seen
     assert "show no payload at hand" in str(nothing.payload)
-
-
-@pytest.mark.slow
-def test_an_inertia_that_recordings_show_is_determined(tmp_path: Path) -> None:
-    robot = experiment(tmp_path)
-    loaded = experiment(tmp_path, **LOAD, inertia=0.02)
-    estimate = mjfim.identify_payload(
-        robot, [log(loaded, 5)], body="hand", robot=mjfim.identify(robot, [log(robot, 4)])
-    )
-    payload = estimate.payload
-    assert payload.edge is None
-    low, high = payload.inertia_interval
-    assert low <= 0.02 <= high
 
 
 @pytest.mark.slow

@@ -29,6 +29,7 @@ def tried(
 
 
 def test_terms_that_left_out_data_refute_are_those_of_the_last_attempt() -> None:
+    """A step that removes a term at several joints has the path of its first joint."""
     steps = (
         BEGUN,
         tried("worse", Decision.REJECTED, -0.1),
@@ -37,6 +38,8 @@ def test_terms_that_left_out_data_refute_are_those_of_the_last_attempt() -> None
         tried("worse later", Decision.REJECTED, 0.1),
         tried("better later", Decision.ADDED, 0.2),
         tried("worse later", Decision.REJECTED, -0.2),
+        tried("worse", Decision.ADDED, 0.2, ("pan", "lift", "roll")),
+        tried("worse", Decision.REMOVED, 0.0),
     )
     selection = Selection(terms=(), steps=steps, ending="No further term.")
     assert selection.refuted == {"worse", "worse later"}
@@ -65,15 +68,3 @@ def test_a_term_at_several_joints_is_refuted_apart_from_that_of_its_first_joint(
     numbers = (number(path="joint/roll:damping"),)
     again = replace(of_joints, numbers=numbers, joints=joints[::-1])
     assert (again.key in selection.refuted) == is_joint_refuted
-
-
-def test_the_removal_of_a_term_is_no_attempt_at_another_one() -> None:
-    """A step that removes a term at several joints has the path of its first joint."""
-    steps = (
-        BEGUN,
-        tried("joint/pan:damping", Decision.REJECTED, -0.1),
-        tried("joint/pan:damping", Decision.ADDED, 0.2, ("pan", "lift", "roll")),
-        tried("joint/pan:damping", Decision.REMOVED, 0.0),
-    )
-    selection = Selection(terms=(), steps=steps, ending="No further term.")
-    assert selection.refuted == {"joint/pan:damping"}
