@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -12,15 +13,20 @@ from scipy.stats import t as student
 import mjfim
 from mjfim.arrays import NORMAL_95
 from mjfim.errors import ExperimentError
-from mjfim.identification.assessment.robust_covariance import block_length
+from mjfim.identification.assessment.recording_comparison import compare_evidence
+from mjfim.identification.assessment.robust_covariance import (
+    block_length,
+    independent_blocks,
+    recording_evidence,
+    robust_uncertainty,
+)
 from mjfim.output.pages import page_of
 from mjfim.records.estimate import PriorDirections
 from mjfim.records.robots import RobotComparison
 from mjfim.records.trajectory import Recording
 from mjfim.records.verdict import Level
 from mjfim.studies.robot_comparison import compare_estimates, holm, honest_std
-from tests.identification.test_recording_comparison import compared
-from tests.identification.test_robust_covariance import Linear, noise, waves
+from tests.identification.test_robust_covariance import FINE, Linear, noise, waves
 from tests.support.made_records import bare_estimate
 
 NAMES = ("mass", "damping", "length")
@@ -63,24 +69,29 @@ def test_a_worn_joint_is_named() -> None:
     found = compare_estimates(estimate(), worn, names=("monday", "friday"))
     assert found.changed == (1,)
     assert found.differs
-    assert "of friday is 40 % above that of monday: 0.21 ± 0.02 against" in found.sentence(1)
+    sentence = found.sentence(1)
+    assert sentence.startswith("damping of friday is 40 % above that of monday: 0.21 ± 0.02 ag")
+    assert "0.15 ± 0.02 N m s/rad, p = " in sentence
+    assert found.words == "There is a difference between monday and friday in damping."
     assert page_of(found).verdict.level is Level.DOUBTFUL
 
     # The distance is 4.2 standard deviations; four tests are made.
-    deviation = 0.01 * 2**0.5
-    assert found.p[1] == pytest.approx(4 * 2 * student.sf(0.06 / deviation, 1e6), rel=1e-2)
-    half = NORMAL_95 * deviation
+    sigmas = 0.06 / np.hypot(0.01, 0.01)
+    assert found.p[1] == pytest.approx(4 * 2 * student.sf(sigmas, 1e6), rel=1e-2)
+    half = NORMAL_95 * 0.01 * 2**0.5
     assert_allclose(found.interval[1], [0.06 - half, 0.06 + half], rtol=1e-3)
 
     # The other way round, the sign changes.
-    assert "of B is 29 % below that of A" in compare_estimates(worn, estimate()).sentence(1)
+    back = compare_estimates(worn, estimate())
+    assert "of B is 29 % below that of A" in back.sentence(1)
 
 
 def test_equal_robots_say_what_would_have_been_found() -> None:
     found = compare_estimates(estimate(), estimate(1, theta=np.array([2.01, 0.152, 0.998])))
     assert not found.differs
+    assert "no difference between A and B. A change of" in found.words
     assert "% in mass" in found.words
-    assert found.remarks == ()
+    assert "with 80 % power" in found.words
     assert page_of(found).verdict.level is Level.GOOD
 
     # 2.50 standard deviations for significance, and 0.84 for the power.
@@ -142,6 +153,10 @@ def test_remarks(of_both: dict[str, Any], of_second: dict[str, Any], said: str) 
     assert found.is_reliable is not is_poor
 
 
+def test_robots_without_a_remark() -> None:
+    assert compare_estimates(estimate(), estimate(1)).remarks == ()
+
+
 def test_known_combinations_are_compared_by_the_honest_covariance() -> None:
     """Noise five times as large as stated, of which single parameters hardly show anything."""
     sums, differences = np.array([1.0, 1.0, 0.0]), np.array([1.0, -1.0, 0.0])
@@ -192,77 +207,91 @@ def test_holm() -> None:
 # ---- rates
 
 
-def robot(
-    rng: np.random.Generator,
-    seed: int,
-    *,
-    K: int,
-    phi: float = 0.0,
-    tau: float = 0.0,
-    c: int = 3,
-    shift: float = 0.0,
-) -> mjfim.Estimate:
-    """Estimate of c parameters, the first of which is shifted, from K recordings.
+@dataclass(frozen=True, eq=False)
+class Setting:
+    """Two robots with K recordings each.
 
-    Args:
-        rng: Random numbers.
-        seed: Number of the robot.
-        K: Number of recordings.
+    Attributes:
+        K: Number of recordings of each robot.
         phi: Correlation of successive noise values.
         tau: Scatter between recordings [standard deviations of one recording].
         c: Number of parameters.
-        shift: Change of the first parameter.
     """
-    N, growth = 400, (1.0 + phi) / (1.0 - phi)
-    model, length = Linear(X=waves(K, N, c)), block_length([growth], K * N)
-    truth = 1.0 + tau * np.sqrt(2.0 / N * growth) * rng.normal(size=(K, c))
-    truth[:, 0] += shift
-    y = noise(phi, (K, N), rng) + np.einsum("knc,kc->kn", model.X, truth)
-    theta, formal, uncertainty = model.assessed(y, length, draws=100)
-    comparison = compared(model, y, length)
-    covariance = np.linalg.inv(model.fitted(y)[1].information())
-    return estimate(
-        seed,
-        K,
-        parameters=comparison.parameters,
-        units=comparison.units,
-        theta=theta,
-        covariance=covariance,
-        std=formal,
-        std_sandwich=uncertainty.sandwich,
-        interval=uncertainty.interval,
-        between_recordings=uncertainty.between,
-        recording_comparison=comparison if K > 1 else None,
-    )
 
+    K: int
+    phi: float = 0.0
+    tau: float = 0.0
+    c: int = 3
 
-def differences(
-    rng: np.random.Generator, setting: dict[str, Any], shift: float = 0.0
-) -> RobotComparison:
-    """Compare two robots."""
-    return compare_estimates(robot(rng, 1, **setting), robot(rng, 2, **setting, shift=shift))
+    def estimated(self, rng: np.random.Generator, shift: float, seed: int) -> mjfim.Estimate:
+        """Estimate of a robot whose first parameter is shifted."""
+        N = 400
+        X = waves(self.K, N, self.c)
+        growth = (1.0 + self.phi) / (1.0 - self.phi)
+        deviations = self.tau * np.sqrt(2.0 / N * growth) * rng.normal(size=(self.K, self.c))
+        deviations[:, 0] += shift
+        y = noise(self.phi, (self.K, N), rng) + np.einsum("knc,kc->kn", X, 1.0 + deviations)
+
+        theta, condensed = Linear(X=X).fitted(y)
+        recording = condensed.segment_of_block
+        rows = np.full(len(recording), float(FINE))
+        length = block_length([growth], self.K * N)
+        own = np.zeros((self.K, 0), dtype=int)
+        uncertainty = robust_uncertainty(
+            condensed, theta, recording, rows, min_rows=length, draws=100, rng=rng, own=own
+        )
+        names, units = tuple(f"p{j}" for j in range(self.c)), ("",) * self.c
+        comparison = None
+        if self.K > 1:
+            blocks = independent_blocks(condensed, recording, rows, length)
+            comparison = compare_evidence(
+                theta,
+                recording_evidence(condensed, blocks, recording, own),
+                recordings=list("abcd"[: self.K]),
+                parameters=names,
+                units=units,
+                is_single=np.ones(self.c, dtype=bool),
+            )
+        covariance = np.linalg.inv(condensed.information())
+        return estimate(
+            seed,
+            self.K,
+            parameters=names,
+            units=units,
+            theta=theta,
+            covariance=covariance,
+            std=np.sqrt(np.diag(covariance)),
+            std_sandwich=uncertainty.sandwich,
+            interval=uncertainty.interval,
+            between_recordings=uncertainty.between,
+            recording_comparison=comparison,
+        )
+
+    def compared(self, rng: np.random.Generator, shift: float = 0.0) -> RobotComparison:
+        """Compare two robots."""
+        return compare_estimates(self.estimated(rng, 0.0, 1), self.estimated(rng, shift, 2))
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "setting",
-    [{"K": 2}, {"K": 1, "phi": 0.9}, {"K": 3, "phi": 0.9, "c": 8}, {"K": 4, "tau": 3.0}],
+    [Setting(K=2), Setting(K=1, phi=0.9), Setting(K=3, phi=0.9, c=8), Setting(K=4, tau=3.0)],
     ids=str,
 )
-def test_rate_of_false_alarms(setting: dict[str, Any]) -> None:
+def test_rate_of_false_alarms(setting: Setting) -> None:
     """The stated level is 5 %; 60 comparisons give more than 7 with a probability of 1 %."""
     rng = np.random.default_rng(1)
-    assert sum(differences(rng, setting).differs for _ in range(60)) <= 7
+    assert sum(setting.compared(rng).differs for _ in range(60)) <= 7
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("setting", [{"K": 1}, {"K": 4, "phi": 0.9}], ids=str)
-def test_rate_of_true_alarms(setting: dict[str, Any]) -> None:
+@pytest.mark.parametrize("setting", [Setting(K=1), Setting(K=4, phi=0.9)], ids=str)
+def test_rate_of_true_alarms(setting: Setting) -> None:
     """A shift as large as the difference that would be found with a probability of 80 %."""
     rng = np.random.default_rng(2)
-    found, hits = differences(rng, setting), 0
+    found, hits = setting.compared(rng), 0
     # A binomial number with 60 and 0.8 is outside with a probability of 4e-4.
     for _ in range(60):
-        found = differences(rng, setting, float(found.detectable[0]))
+        found = setting.compared(rng, float(found.detectable[0]))
         hits += 0 in found.changed
     assert 37 <= hits <= 57
