@@ -30,7 +30,7 @@ from mjfim.experiment.schema import Experiment, ExperimentLike, experiment_of
 from mjfim.experiment.stated_units import require_units
 from mjfim.experiment.time_grid import TimeGrid, noise_strides
 from mjfim.model.clearance import with_floor
-from mjfim.model.control_laws import FIELDS, ControlLaws, law_unit
+from mjfim.model.control_laws import FIELDS, TIMES, ControlLaws, law_unit
 from mjfim.model.coordinates import (
     ScalarJoint,
     control_labels,
@@ -619,15 +619,7 @@ def labels_of_model(model: mujoco.MjModel) -> Labels:
 
 
 # Numbers with which a law is more than a position servo, unless they have no effect.
-BEYOND_SERVOS = {
-    "ki",
-    "slew",
-    "latency",
-    "time_constant",
-    "feedback_latency",
-    "velocity_time_constant",
-    "acceleration",
-}
+BEYOND_SERVOS = {*TIMES, "ki", "slew", "acceleration"}
 
 
 def laws_in_loop(

@@ -369,6 +369,8 @@ def _with_lost_held(search: FitSearch, fit: FitResult) -> FitResult:
         # Longer differences may show an effect, such as that of a limit which is hardly reached.
         columns = np.flatnonzero(np.diag(information) == 0.0)
         silent = np.unique(fit.problem.parameter_of_column[columns])
+        if not len(silent):
+            return fit
         axes = np.eye(len(fit.theta))
         lost = NullSpace(
             directions=np.concatenate([fit.null_space.directions, axes[:, silent]], axis=1),
@@ -376,8 +378,6 @@ def _with_lost_held(search: FitSearch, fit: FitResult) -> FitResult:
             basis=np.delete(axes, silent, axis=1),
             smallest=0.0,
         )
-    if not lost.count:
-        return fit
     held = fit.problem.pinned(fit.theta, lost)
     found = _fitted_from(search, held, fit.solution.unknowns, "all data, held", fit)
     return fit if found is None else replace(found, null_space=lost)

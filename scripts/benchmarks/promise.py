@@ -266,7 +266,7 @@ def main() -> int:
         rows = [slice(int(np.searchsorted(each.t - each.t[0], args.seconds))) for each in read]
         logs = [part_of(log, cut, log.name) for log, cut in zip(read, rows, strict=True)]
         jobs.append((args.experiment.stem, stated, logs))
-        args.only = args.experiment.stem
+        args.only = ""  # no other robot
     for measured in {each.name: each for each in SETS}.values():
         if args.only in (None, measured.name) and (args.data / measured.folder).is_dir():
             logs = measured.read(args.data, LOGS[measured.name][: args.logs])

@@ -191,8 +191,8 @@ def main() -> int:
     outputs, laws = (
         "".join(text.replace("JOINT", each) for each in JOINTS) for text in (OUTPUT, JOINT)
     )
-    head, gripper = laws.rsplit("ACCELERATION", 1)
-    laws = f"{head.replace('ACCELERATION', '38.96')}20.0{gripper}"
+    # The gripper is the last joint.
+    laws = laws.replace("ACCELERATION", "38.96", len(JOINTS) - 1).replace("ACCELERATION", "20.0")
     tables = ARM + outputs + SHARED + laws
     for name, paths in shared.items():
         tables = tables.replace(f"[{name}]", f"[{paths}]")
