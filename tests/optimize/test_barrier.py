@@ -24,20 +24,6 @@ INF = np.inf
 S = np.array([-3.0, -0.2, 0.0, 0.04, 0.0499, 0.0501, 0.06, 0.4, 1.0, 3.0])
 
 
-@pytest.mark.parametrize("delta", [0.1, 1e-4])
-def test_the_barrier_is_twice_continuous_where_it_relaxes(delta: float) -> None:
-    """Value, slope and curvature agree from both sides; the curvature falls towards the inside and
-    is constant outside.
-    """
-    below, above = np.array(
-        relaxed_log_barrier(delta * np.array([1.0 - 1e-9, 1.0 + 1e-9]), delta)
-    ).T
-    powers = delta ** np.arange(3)
-    assert_allclose(below * powers, above * powers, rtol=0, atol=1e-7)
-    curvature = relaxed_log_barrier(delta * np.array([0.9, 1.1]), delta)[2]
-    assert curvature * delta**2 == pytest.approx([1.0, 1.1**-2])
-
-
 @pytest.mark.parametrize("delta", [0.05, 0.3])
 def test_derivatives_agree_with_differences_on_both_sides(delta: float) -> None:
     h = 1e-6

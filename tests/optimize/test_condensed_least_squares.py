@@ -246,37 +246,6 @@ def test_undetermined_private_unknowns_do_not_break_the_step(damping: float) -> 
         assert np.isfinite(dense.condensed.information()).all()
 
 
-def test_step_lengths_are_standard_deviations() -> None:
-    """Common steps use the marginal information, private ones that at constant theta."""
-    dense = problem(4, inner=3)
-    step = dense.step()
-    length = np.linalg.norm(dense.left_of_shared() @ step.common)
-    assert step.common_length == pytest.approx(length, rel=1e-8)
-    private = np.linalg.norm(dense.starts @ step.private.ravel())
-    assert step.private_length == pytest.approx(private / np.sqrt(step.private.size), rel=1e-8)
-
-
-def test_units_of_the_unknowns_do_not_matter() -> None:
-    """Columns ten orders of magnitude apart give equal steps in these units."""
-    C = problem(9, inner=3, outer=4).condensed
-    unit = np.array([1e6, 1e-4, 1e-5, 1.0, 1e5, 1.0])
-    shared = unit[2:-1]
-    other = replace(
-        C,
-        blocks=C.blocks * unit,
-        private_rows=C.private_rows * unit,
-        common_rows=C.common_rows * unit[2:],
-    )
-    for lower in (-FREE, -0.01):
-        bound = np.full(3, lower)
-        one = C.step(1e-4, C.column_norms, bound, -bound)
-        two = other.step(1e-4, other.column_norms, bound / shared, -bound / shared)
-        close(two.common * shared, one.common, rtol=1e-6)
-        close(two.private * unit[:2], one.private, rtol=1e-6)
-        assert two.common_length == pytest.approx(one.common_length, rel=1e-6)
-    close(other.information(), C.information() * np.outer(shared, shared), rtol=1e-6)
-
-
 def gradients_after(condensed: Condensed, common: Array) -> Array:
     """(P, c) gradients of half of the squares of each segment after a step, without common rows."""
     rows = condensed.reduced_rows().reshape(condensed.segment_count, -1, len(common) + 1)

@@ -16,7 +16,6 @@ from mjfim.excitation.limits.constraints import constraint_set_of
 from mjfim.information.criteria import smooth_e_optimality
 from mjfim.optimize.cost_models import (
     EigenvalueModel,
-    divided_log_differences,
     symmetric_coordinates,
     symmetric_matrix,
 )
@@ -98,14 +97,6 @@ def test_the_minimising_gradient_solves_the_proximal_problem(values: str) -> Non
         w = model.minimising_gradient(d0, spread)
         best = minimize(cost, np.zeros(rank), method="BFGS", options={"gtol": 1e-10})
         assert_allclose(d0 - spread @ w, d0 + root @ best.x, rtol=0, atol=1e-5)
-
-
-def test_divided_differences_give_the_derivative_of_the_matrix_logarithm() -> None:
-    values, rng = np.array([0.5, 0.5 * (1 + 1e-9), 2.0]), np.random.default_rng(4)
-    change = rng.normal(size=(3, 3))
-    change = 1e-6 * (change + change.T)
-    slope = (logm(np.diag(values) + change) - logm(np.diag(values) - change)) / 2.0
-    assert_allclose(divided_log_differences(values) * change, slope, rtol=1e-5, atol=1e-12)
 
 
 @pytest.mark.parametrize(

@@ -107,18 +107,6 @@ def test_weighted_descent_is_the_minimum(sizes: Any, steps: bool) -> None:
     assert_allclose(zeta.z, response(zeta.v), rtol=0, atol=1e-8 * max(np.abs(zeta.z).max(), 1.0))
 
 
-def test_force_is_half_the_derivative_of_the_form() -> None:
-    rng = np.random.default_rng(21)
-    N, nx, nu = 9, 3, 2
-    weights = random_weights(rng, N, nx, nu, steps=True)
-    z, v, dz, dv = (rng.normal(size=s) for s in ((N + 1, nx), (N, nu), (N + 1, nx), (N, nu)))
-    a, b = weights.half_gradient(TangentCurve(z=z, v=v))
-    # The difference of a quadratic form is exact.
-    slope = 0.25 * (form(weights, z + dz, v + dv) - form(weights, z - dz, v - dv))
-    assert np.sum(a * dz) + np.sum(b * dv) == pytest.approx(slope, rel=1e-12)
-    assert np.sum(a * z) + np.sum(b * v) == pytest.approx(form(weights, z, v), rel=1e-12)
-
-
 def test_a_control_weight_that_is_not_positive_is_refused() -> None:
     A, B, flat = np.ones((3, 1, 1)), np.ones((3, 1, 1)), np.zeros((1, 1))
     with pytest.raises(np.linalg.LinAlgError, match="positive"):

@@ -16,7 +16,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy.optimize import minimize
 
 from mjfim.optimize import projection_operator
-from mjfim.optimize.directions import LBFGS, MetricDescent, convex_pairs
+from mjfim.optimize.directions import LBFGS, MetricDescent
 from mjfim.optimize.lq import TangentCurve, amplification_in_best_units
 from mjfim.optimize.projection_operator import (
     Armijo,
@@ -352,12 +352,6 @@ def test_lbfgs_direction_is_minus_the_inverse_bfgs_matrix_times_the_gradient() -
     assert expansion.slope(zeta) < 0.0
 
 
-def test_lbfgs_without_memory_is_steepest_descent_in_the_control_metric() -> None:
-    _, expansion, K, zeta = begun(Pendulum(), LBFGS(R * DT))
-    c = expansion.coordinates(K).coordinate(zeta)
-    assert_allclose(c, -expansion.gradient(K) / (R * DT), rtol=1e-10)
-
-
 def test_lbfgs_refuses_pairs_of_negative_curvature_and_can_be_reset() -> None:
     direction = LBFGS(R * DT)
     _, expansion, K, _ = begun(Pendulum(), direction)
@@ -401,11 +395,3 @@ def test_feedback_only_above_the_threshold_of_amplification(
     monkeypatch.delattr(projection_operator, "amplification_in_best_units")
     assert not gain(np.inf).any()
     assert gain(0.0).any()
-
-
-def test_only_pairs_of_clearly_positive_curvature_are_kept() -> None:
-    s = np.array([[1.0, 0.0], [1.0, 0.0], [0.0, 0.0], [0.0, 2.0]])
-    y = np.array([[3.0, 1.0], [-1.0, 5.0], [1.0, 1.0], [1.0, 1e-9]])
-    kept = convex_pairs(s, y, 1e-8)
-    assert [curvature for _, _, curvature in kept] == [3.0]
-    assert_array_equal(kept[0][1], y[0])

@@ -262,19 +262,6 @@ def test_stored_pairs_do_not_contain_the_barrier() -> None:
     assert direction.damping < 1e-3
 
 
-def test_no_step_changes_a_limited_quantity_by_more_than_the_reach() -> None:
-    toy, ridge = Toy(1e-4), np.full(NU, 1e-6)
-    e = toy.expand(toy.point(np.zeros((N, NU))))
-    long, short = (StructuredBFGS(ridge, reach=reach)(e, OPEN_LOOP) for reach in (1e9, 0.25))
-    assert e.barrier.largest_relative_move(long) > 1.0
-    assert 0.05 < e.barrier.largest_relative_move(short) <= 0.25 * (1.0 + 1e-12)
-    assert e.slope(short) < 0.0
-
-    # A short step stays as it is.
-    tiny = StructuredBFGS(np.ones(NU))(replace(e, a=1e-9 * e.a, b=1e-9 * e.b), OPEN_LOOP)
-    assert e.barrier.largest_relative_move(tiny) < 1e-6
-
-
 def test_damping_keeps_the_step_back_inside_the_limits() -> None:
     """The point is outside a bound, and the cost pulls in another direction.
 
