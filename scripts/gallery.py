@@ -34,6 +34,7 @@ import tomlkit
 from PIL import Image
 
 from mjfim.output.plots.pictures import kind_of_picture
+from scripts.benchmarks import child
 from scripts.benchmarks.child import ROOT, SHARED, options_of
 from scripts.benchmarks.so101 import JOINTS, read_motion
 from scripts.verbs import call_verb
@@ -255,9 +256,9 @@ def write_log(source: Path, target: Path) -> None:
     """
     with gzip.open(source / "state_motor.csv.gz", "rt", encoding="utf-8") as opened:
         stamps = np.array([float(row["timestamp"]) for row in csv.DictReader(opened)])
-    table = np.column_stack([1e-6 * (stamps - stamps[0]), read_motion(source)])[:LOG_ROWS]
+    seconds, motion = 1e-6 * (stamps - stamps[0]), read_motion(source)
     names = ["t", *(f"{kind}:{joint}" for kind in ("ctrl", "qpos") for joint in JOINTS)]
-    np.savetxt(target, table, "%.6f", delimiter=",", header=",".join(names), comments="")
+    child.write_log(target, names, seconds[:LOG_ROWS], motion[:LOG_ROWS])
 
 
 def _call(words: Sequence[str], root: Path) -> Shown:

@@ -34,7 +34,7 @@ import numpy as np
 from mjfim.arrays import record
 from mjfim.experiment.initial import multisine
 from mjfim.experiment.schema import Experiment
-from scripts.benchmarks.child import SHARED
+from scripts.benchmarks.child import SHARED, write_log
 
 # Timestep of the engine [s].
 TIMESTEP = 0.002
@@ -275,10 +275,7 @@ def experiment(name: str, horizon: float, friction: bool, folder: Path) -> Exper
     wave = multisine(t, len(hold), FUNDAMENTAL, HARMONICS, np.random.default_rng(0))
     start = hold + arm.amplitude * np.sin(0.5 * np.pi * growth)[:, None] ** 2 * wave
     control = folder / f"{path.stem}_{horizon:g}s.csv"
-    header = ",".join(["t", *arm.joints])
-    np.savetxt(
-        control, np.column_stack([t, start]), fmt="%.12g", delimiter=",", header=header, comments=""
-    )
+    write_log(control, ["t", *arm.joints], t, start, form="%.12g")
 
     parameters: dict[str, Any] = {
         f"{joint}_{field}": {"target": f"joint/{joint}:{field}"}

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 from rich.progress import track
 from rich.table import Table
 
@@ -43,6 +44,27 @@ def options_of(description: str | None, runs: int = 0) -> argparse.ArgumentParse
         parser.add_argument("--processes", type=int, default=cores(), help="runs side by side")
         parser.add_argument("-o", "--output", type=Path, help="JSON file with all outcomes")
     return parser
+
+
+def paths_of(description: str | None) -> tuple[Path, Path, Path]:
+    """Data, model in MJCF, and the folder of the output, which is made."""
+    parser = options_of(description)
+    parser.add_argument("paths", type=Path, nargs=3, help="data, model in MJCF, output")
+    data, model, output = parser.parse_args().paths
+    output.mkdir(parents=True, exist_ok=True)
+    return data, model, output
+
+
+def write_log(path: Path, names: Sequence[str], *columns: ArrayLike, form: str = "%.6f") -> None:
+    """Write a CSV file, whose columns may be arrays of several."""
+    rows = np.column_stack(columns)
+    np.savetxt(path, rows, form, delimiter=",", header=",".join(names), comments="")
+
+
+def overlap(first: Array, second: Array) -> Array:
+    """Whether (..., 2) intervals overlap."""
+    lower, upper = np.maximum(first, second)[..., 0], np.minimum(first, second)[..., 1]
+    return np.asarray(lower <= upper)
 
 
 def study(

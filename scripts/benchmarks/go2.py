@@ -22,7 +22,7 @@ import mjfim
 from mjfim.arrays import Array
 from mjfim.experiment.system import System
 from mjfim.recordings.read import read_recording
-from scripts.benchmarks.child import new_table, options_of, rms
+from scripts.benchmarks.child import new_table, overlap, paths_of, rms, write_log
 
 LEGS = ("FL", "FR", "RL", "RR")
 KINDS = ("hip", "thigh", "calf")
@@ -201,8 +201,9 @@ def relative_widths(estimate: mjfim.Estimate, joint: str) -> list[float]:
     covariance = estimate.honest_covariance[np.ix_(places, places)] / np.outer(values, values)
     weights = np.vstack([np.eye(3), [[-1.0, 1.0, 0.0], [-1.0, 0.0, 1.0]]])
     # The variance of what is not determined is infinite; other weights are zero.
-    counted = [(row[row != 0.0], covariance[np.ix_(row != 0.0, row != 0.0)]) for row in weights]
-    return [196.0 * float(np.sqrt(row @ part @ row)) for row, part in counted]
+    parts = [covariance[np.ix_(row != 0.0, row != 0.0)] for row in weights]
+    rows = (row[row != 0.0] for row in weights)
+    return [196.0 * float(np.sqrt(w @ C @ w)) for w, C in zip(rows, parts, strict=True)]
 
 
 def quantities_of(estimate: mjfim.Estimate, joint: str) -> dict[str, tuple[float, Array]]:
@@ -217,21 +218,13 @@ def quantities_of(estimate: mjfim.Estimate, joint: str) -> dict[str, tuple[float
 
 def apart(*found: dict[str, tuple[float, Array]]) -> str:
     """Return the quantities of two joints whose intervals do not overlap."""
-    names = []
-    for name in found[0]:
-        (_, a), (_, b) = (each[name] for each in found)
-        if name != "feedback" and (a[1] < b[0] or b[1] < a[0]):
-            names.append(name)
-    return str(names or "nothing")
+    names = [name for name in found[0] if not overlap(*(each[name][1] for each in found))]
+    return str([name for name in names if name != "feedback"] or "nothing")
 
 
 def main() -> int:
     """Fit and predict all legs, and print what was found."""
-    parser = options_of(__doc__)
-    parser.add_argument("paths", type=Path, nargs=3, help="data, model in MJCF, output")
-    data, model, output = parser.parse_args().paths
-
-    output.mkdir(parents=True, exist_ok=True)
+    data, model, output = paths_of(__doc__)
     log = np.genfromtxt(data / "traj_0.csv.gz", delimiter=",", names=True)
     every = [f"{leg}_{kind}" for leg in LEGS for kind in KINDS]
     angles, references = (
@@ -253,9 +246,8 @@ def main() -> int:
         logs: dict[str, list[mjfim.Recording]] = {half: [] for half in HALVES}
         for half, part in ((half, part) for half, parts in HALVES.items() for part in parts):
             path = output / f"{leg}_from_row_{part.start}.csv"
-            rows = np.hstack([references[part, columns], angles[part, columns]])
-            timed = np.column_stack([PERIOD * np.arange(len(rows)), rows])
-            np.savetxt(path, timed, "%.7f", ",", header=",".join(header), comments="")
+            asked, moved = references[part, columns], angles[part, columns]
+            write_log(path, header, PERIOD * np.arange(len(moved)), asked, moved, form="%.7f")
             logs[half].append(read_recording(path, system.channels))
         for half, others in zip(HALVES, reversed(HALVES), strict=True):
             fitted = mjfim.identify(experiment, logs[half], held_out=logs[others])

@@ -16,8 +16,9 @@ from __future__ import annotations
 
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
+from itertools import chain, combinations, starmap
 from pathlib import Path
 
 import mujoco
@@ -30,7 +31,7 @@ from mjfim.experiment.system import System
 from mjfim.identification.identify import identify_system
 from mjfim.recordings.read import read_recording
 from mjfim.records.estimate import Estimate
-from scripts.benchmarks.child import ROOT, SHARED, new_table, options_of
+from scripts.benchmarks.child import ROOT, SHARED, new_table, options_of, overlap
 from scripts.benchmarks.measured_data import SERVO_TIMES, SETS, servo_files
 
 # Logs of the measured robots, by the name of their experiment.
@@ -163,27 +164,18 @@ def simulated_log(robot: SimulatedRobot, system: System, number: int) -> mjfim.R
     )
 
 
-def part_of(recording: mjfim.Recording, rows: slice, name: str) -> mjfim.Recording:
+def part_of(recording: mjfim.Recording, rows: slice) -> mjfim.Recording:
     """Some rows of a recording."""
     t = recording.t[rows]
-    return replace(
-        recording, t=t - t[0], ctrl=recording.ctrl[rows][: len(t)], y=recording.y[rows], name=name
-    )
+    ctrl = recording.ctrl[rows][: len(t)]
+    return replace(recording, t=t - t[0], ctrl=ctrl, y=recording.y[rows])
 
 
-def halves(recording: mjfim.Recording) -> Iterator[mjfim.Recording]:
-    """The two halves of a recording."""
-    middle = len(recording.t) // 2
-    yield part_of(recording, slice(None, middle), f"{recording.name}, first half")
-    yield part_of(recording, slice(middle, None), f"{recording.name}, second half")
-
-
-def overlap(first: Estimate, second: Estimate) -> np.ndarray:
+def agreement(first: Estimate, second: Estimate) -> np.ndarray:
     """Whether intervals overlap, for each parameter that both estimates determine."""
     asked = np.isin(first.parameters, first.nuisance, invert=True)
     asked &= np.isfinite(first.honest_std) & np.isfinite(second.honest_std)
-    low = np.maximum(first.interval[:, 0], second.interval[:, 0])
-    return np.asarray(low <= np.minimum(first.interval[:, 1], second.interval[:, 1]))[asked]
+    return overlap(first.interval, second.interval)[asked]
 
 
 def share(flags: Sequence[bool]) -> str:
@@ -196,8 +188,12 @@ def row_of(robot: str, experiment: mjfim.Experiment, logs: Sequence[mjfim.Record
     clock = time.process_time()
     system = System.resolve(experiment)
     alone = [identify_system(system, [log]) for log in logs]
-    split = [[identify_system(system, [half]) for half in halves(log)] for log in logs]
-    pairs = [overlap(a, b) for i, a in enumerate(alone) for b in alone[i + 1 :]]
+    split = []
+    for log in logs:
+        middle = len(log.t) // 2
+        parts = [part_of(log, rows) for rows in (slice(middle), slice(middle, None))]
+        split.append(agreement(*(identify_system(system, [part]) for part in parts)))
+    pairs = list(starmap(agreement, combinations(alone, 2)))
     moved: set[str] = set()
 
     ratios: tuple[list[float], list[float]] = ([], [])
@@ -236,9 +232,8 @@ def row_of(robot: str, experiment: mjfim.Experiment, logs: Sequence[mjfim.Record
         span = f"{np.median(each):.2g} ({min(each):.2g} to {max(each):.2g})"
         cells += [share(kept), span]
     seconds = f"{(time.process_time() - clock) / 60.0:.1f}"
-    agreed = [flag for each in pairs for flag in each.tolist()]
-    of_halves = [flag for a, b in split for flag in overlap(a, b).tolist()]
-    return [robot, *cells, seconds, share(of_halves), share(agreed)]
+    overlaps = (share([*chain.from_iterable(each)]) for each in (split, pairs))
+    return [robot, *cells, seconds, *overlaps]
 
 
 def main() -> int:
@@ -263,8 +258,8 @@ def main() -> int:
         stated = mjfim.Experiment.from_file(args.experiment)
         channels = System.resolve(stated).channels
         read = [read_recording(path, channels) for path in args.files]
-        rows = [slice(int(np.searchsorted(each.t - each.t[0], args.seconds))) for each in read]
-        logs = [part_of(log, cut, log.name) for log, cut in zip(read, rows, strict=True)]
+        ends = (int(np.searchsorted(each.t - each.t[0], args.seconds)) for each in read)
+        logs = [part_of(log, slice(end)) for log, end in zip(read, ends, strict=True)]
         jobs.append((args.experiment.stem, stated, logs))
         args.only = ""  # no other robot
     for measured in {each.name: each for each in SETS}.values():

@@ -24,7 +24,7 @@ import mjfim
 from mjfim.arrays import Array
 from mjfim.experiment.system import System
 from mjfim.recordings.read import read_recording
-from scripts.benchmarks.child import new_table, options_of, rms
+from scripts.benchmarks.child import new_table, paths_of, rms, write_log
 
 JOINTS = ["shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll", "gripper"]
 
@@ -172,11 +172,7 @@ def numbers_of(row: str) -> Array:
 
 def main() -> int:
     """Fit, predict, and print the errors of all motions."""
-    parser = options_of(__doc__)
-    parser.add_argument("paths", type=Path, nargs=3, help="data, model in MJCF, output")
-    data, model, output = parser.parse_args().paths
-
-    output.mkdir(parents=True, exist_ok=True)
+    data, model, output = paths_of(__doc__)
     text = model.read_text(encoding="utf-8")
     for change in CHANGES.items():
         text = text.replace(*change)
@@ -199,16 +195,14 @@ def main() -> int:
     (output / "so101.toml").write_text(tables, encoding="utf-8")
     experiment = mjfim.Experiment.from_file(output / "so101.toml")
 
-    columns = [f"{kind}:{joint}" for kind in ("reference", "qpos") for joint in JOINTS]
-    header = ",".join(["time", *columns])
+    header = ["time", *(f"{kind}:{joint}" for kind in ("reference", "qpos") for joint in JOINTS)]
     motions = {name: read_motion(data / name) for name in [*FITTED, *HELD_OUT.split()]}
     channels = System.resolve(experiment).channels
 
     def recording(name: str, rows: slice) -> mjfim.Recording:
         """Write rows of a motion as a log, and read it."""
         log, part = output / f"{name}.csv", motions[name][rows]
-        timed = np.column_stack([PERIOD * np.arange(len(part)), part])
-        np.savetxt(log, timed, "%.6f", ",", header=header, comments="")
+        write_log(log, header, PERIOD * np.arange(len(part)), part)
         return read_recording(log, channels)
 
     begun = time.perf_counter()
