@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.testing import assert_allclose, assert_array_equal
+from numpy.testing import assert_allclose
 
 from mjfim.excitation.limits.constraints import constraint_set_of
 from mjfim.excitation.search.interior_problem import DIVERGED_POINT, InteriorProblem, values_of
@@ -112,21 +112,6 @@ def test_a_reevaluated_point_equals_that_of_the_new_problem(tmp_path: Path) -> N
         e, f = other.expand(again), other.expand(fresh)
         assert_allclose(e.a, f.a, rtol=1e-9)
         assert_allclose(e.b, f.b, rtol=1e-9)
-
-
-def test_steering_inside_has_no_cost(tmp_path: Path) -> None:
-    task, problem = problem_of("E", tmp_path)
-    inward = replace(problem, mu=1.0, with_cost=False)
-    begun = task.plant.simulator.steps
-    point = inward.point(task.control)
-    # One rollout, no sensitivity.
-    assert task.plant.simulator.steps - begun == task.samples * task.system.grid.substeps
-    assert (point.point, point.merit) == (None, 0.0)
-    assert inward.value(point) == point.barrier == problem.point(task.control).barrier
-    expansion = inward.expand(point)
-    assert_array_equal(expansion.a, expansion.barrier.a)
-    assert check(task, inward, expansion) < 2e-3
-    assert inward.reevaluate(point) is point
 
 
 def test_a_diverged_trial_has_infinite_value(tmp_path: Path) -> None:

@@ -9,22 +9,18 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
-from numpy.testing import assert_allclose
 
 from mjfim.errors import ExperimentError
-from mjfim.excitation.limits.constraint_kinds import Magnitude
-from mjfim.excitation.limits.constraints import constraint_set_of
 from mjfim.excitation.limits.limits import limits_of
 from mjfim.excitation.limits.verification import require_feasible_start, verify, violations_of
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.system import labels_of_model
 from mjfim.experiment.task_tables import Limits
 from mjfim.model.coordinates import control_names
-from mjfim.optimize.cost_models import BarrierDerivatives
 from mjfim.plant.active_constraints import saturated_actuators
 from mjfim.records.trajectory import Trajectory
-from tests.support.limits import along_control, barrier_check, barrier_problem, excess_of, of_kind
-from tests.support.numerics import Array, make_task
+from tests.support.limits import barrier_check, barrier_problem, excess_of, of_kind
+from tests.support.numerics import make_task
 
 # A hull that floats, with a mast on a ball joint and an arm on a hinge. The mast is turned by an
 # actuator with three forces, the arm by two actuators on a tendon and by one on its joint.
@@ -394,27 +390,6 @@ def test_the_slope_of_all_limits_together_holds_with_every_integrator(
     assert barrier_check(task, 0.05) < 2e-3
 
 
-@pytest.mark.parametrize("is_angle", [False, True])
-def test_derivatives_of_the_barrier_of_a_norm_are_those_of_differences(is_angle: bool) -> None:
-    """Also at the norm zero, near the bound and beyond it."""
-    magnitude, step = Magnitude(columns=(1, 2, 3), is_angle=is_angle), 1e-5
-    share = magnitude.norm_at(0.7)
-    moves = step * share * np.eye(4)[1:]
-
-    def at(y: Array) -> BarrierDerivatives:
-        return magnitude.barrier(y, 0.7, 0.8, delta=0.01, weight=0.5)
-
-    for norm in (0.0, 1e-6, 0.3, 0.995, 1.2):
-        here = share * norm * np.array([0.0, 2.0, -1.0, 2.0]) / 3.0
-        found, pairs = at(here), [(at(here + move), at(here - move)) for move in moves]
-        slope = np.array([up.value - down.value for up, down in pairs]) / (2 * step * share)
-        bend = np.array([up.slope - down.slope for up, down in pairs]) / (2 * step * share)
-        size = np.abs(found.curvature).max()
-        assert_allclose(found.slope, slope, rtol=1e-5, atol=1e-7 * size)
-        assert_allclose(found.curvature, bend, rtol=1e-4, atol=1e-4 * size)
-        assert np.linalg.eigvalsh(found.curvature).min() > 0.0
-
-
 def test_every_engine_step_of_the_unmodified_model_is_checked(tmp_path: Path) -> None:
     """Margins, usage and violations are those of a player that shares no code with the package."""
     one_motor = ship().replace("<orientation", "<motor").replace('kp="3"', 'gear="2 1 0.5"')
@@ -430,24 +405,6 @@ def test_every_engine_step_of_the_unmodified_model_is_checked(tmp_path: Path) ->
     assert {(v.kind, v.name) for v in violations_of(task, found)} == {
         key for key, value in excess.items() if value > 0.0
     }
-
-
-def test_a_clamped_sum_of_forces_is_lifted_in_the_search_and_kept_as_a_limit(
-    tmp_path: Path,
-) -> None:
-    """The ranges of the MJCF do not clamp the private copy, whose derivatives they would hide."""
-    text = RANGED.replace('"-3 4"', '"-0.1 0.1"').replace('forcerange="0 5"', 'forcerange="0 0.2"')
-    task = ship_task(tmp_path, text)
-    free = task.relaxed()
-    relaxed = free.plant.model(task.theta)
-    for name in ("tendon_actfrclimited", "tendon_limited", "jnt_limited", "actuator_forcelimited"):
-        assert not getattr(relaxed, name).any()
-
-    constraints = constraint_set_of(free)
-    margins = constraints.margins(along_control(free, constraints))
-    assert margins["tendon_force"] < 0.0 and margins["force"] < 0.0
-    found = verify(task, task.initial).margins
-    assert (found["tendon_force"], found["force"]) == pytest.approx((0.0, 0.0), abs=1e-12)
 
 
 def test_a_start_outside_is_refused_with_its_unit(tmp_path: Path) -> None:
@@ -550,11 +507,3 @@ def test_limits_of_a_free_body_do_not_depend_on_units(
         stated(length, mass, time), stated(1.0, 1.0, 1.0), (1e-6, 1e-6, 1e-4), strict=True
     ):
         assert here == pytest.approx(there, rel=accuracy)
-
-
-def test_angles_may_be_stated_in_degrees(tmp_path: Path) -> None:
-    box = (("-40 cm", "40 cm"), (-0.4, 0.4), (0.7, 1.3))
-    limits = {"tilt": "30 deg", "velocity": {"float": "80 cm/s"}, "position": {"float": box}}
-    found = {limit.title: limit.upper for limit in ship_task(tmp_path, limits=limits).limits}
-    wanted = {"tilt of float": np.pi / 6, "velocity of float": 0.8, "position of float.x": 0.4}
-    assert {title: found[title] for title in wanted} == pytest.approx(wanted)

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.testing import assert_allclose
 
 import mjfim
 from mjfim.experiment.system import System
@@ -41,23 +40,6 @@ def problem_of(folder: Path, count: int, segments: float | str = "whole") -> Fit
     system = System.resolve(experiment_of(folder, "tilt", fit=fit))
     logs = [recorded(system, motor_torque(2.0, RATE, seed), seed) for seed in range(count)]
     return FitProblem.of(system, logs)
-
-
-def test_a_part_has_the_begin_of_each_recording(tmp_path: Path) -> None:
-    problem = problem_of(tmp_path, 4)
-    part, segments = part_of_data(problem, 136.0)
-    found = part.segments
-    assert [(each.recording, each.begin, each.samples) for each in found] == [
-        (i, 0, 34) for i in range(4)
-    ]
-    assert part.sample_count == 136
-
-    # The part has the residuals that these rows have among all.
-    at = problem.begin(problem.system.parameters.guess)
-    predicted, whole = part.predict(of_subset(at, segments)), problem.predict(at)
-    for y, complete, segment in zip(predicted, whole, found, strict=True):
-        assert_allclose(y[segment.rows], complete[segment.rows])
-        assert np.isnan(y[segment.rows.stop :]).all()
 
 
 def test_a_part_has_segments_of_each_recording(tmp_path: Path) -> None:

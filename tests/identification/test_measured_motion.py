@@ -20,7 +20,7 @@ from mjfim.identification.inverse_dynamics.motion import (
     measured_motion,
 )
 from mjfim.records.trajectory import Recording
-from tests.support.numerics import Array, body_task, cart_task
+from tests.support.numerics import Array, body_task
 from tests.support.terms import recorded
 
 
@@ -67,16 +67,6 @@ def test_orientations_turn_with_the_angular_velocity_of_the_body(tmp_path: Path)
         assert_allclose(norm, 1.0, rtol=1e-12)
     places, _ = inner(motion, qpos, task.dt)
     assert np.abs(motion.qpos[inside] - places).max() < 0.01
-
-
-def test_points_in_gaps_do_not_count(tmp_path: Path) -> None:
-    task = cart_task(tmp_path, horizon=4.0)
-    rows = np.concatenate([np.arange(150), np.arange(250, 401)])
-    motion, _, _ = motion_of(task, rows=rows)
-    middle = (motion.t > 1.6) & (motion.t < 2.4)
-    assert middle.any()
-    assert not motion.usable[middle].any()
-    assert motion.usable[(motion.t > 0.1) & (motion.t < 1.4)].all()
 
 
 def test_unmeasured_degrees_of_freedom_are_named(tmp_path: Path) -> None:

@@ -18,7 +18,6 @@ from mjfim.identification.search import FitTask
 from mjfim.information.criteria import standard_deviations
 from mjfim.records.trajectory import Recording
 from tests.support.cart_pendulum import cart_pendulum, logs_of
-from tests.support.numerics import Loop
 
 Array = NDArray[np.float64]
 
@@ -99,25 +98,6 @@ def test_a_stream_tells_what_a_fit_of_the_recording_predicts(
     known = np.isfinite(found.std_over_time).all(axis=1)
     falls = np.diff(found.std_over_time[known], axis=0)
     assert known.sum() > 10 and (falls <= 1e-9 * found.std).all()
-
-
-def test_the_information_is_that_of_plain_simulations(log: Recording) -> None:
-    system = System.resolve(STUDY, threads=1)
-    guess = system.parameters.guess
-
-    def outputs(theta: Array) -> Array:
-        """States at the samples, by a plain loop."""
-        loop = Loop(system.model_at(theta), system.grid.substeps)
-        states = [system.nominal_initial_state]
-        for u in log.ctrl:
-            states.append(loop.F(states[-1], u))
-        return np.array(states)
-
-    moves = 1e-5 * np.diag(guess)
-    G = np.stack([(outputs(guess + h) - outputs(guess - h)) / (2.0 * h.sum()) for h in moves], -1)
-    rows = (G / system.noise.sigma[:, None]).reshape(-1, len(guess))
-    expected = np.sqrt(np.diag(np.linalg.inv(rows.T @ rows)))
-    assert_allclose(watched(STUDY, log).std, expected, rtol=TOLERANCE)
 
 
 def test_priors_count_as_in_a_fit(log: Recording) -> None:

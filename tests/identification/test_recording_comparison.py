@@ -18,7 +18,6 @@ from mjfim.identification.assessment.recording_comparison import (
     f_tail,
     random_effects,
     satterthwaite,
-    with_scatter,
 )
 from mjfim.identification.assessment.robust_covariance import (
     block_length,
@@ -217,17 +216,6 @@ def test_missing_estimates_are_left_out() -> None:
     assert not np.isfinite(found.prediction).any()
 
 
-@pytest.mark.parametrize("tau", [0.0, 1.0, 3.0])
-def test_intervals_for_another_recording_hold_its_estimate(tau: float) -> None:
-    """Exact for equal variances, whatever the scatter between recordings is."""
-    rng = np.random.default_rng(1)
-    count, sets = 4, 4000
-    values = rng.normal(size=(count + 1, sets)) * np.hypot(1.0, tau)
-    low, high = random_effects(values[:-1], np.ones((count, sets)), 1e9).prediction.T
-    inside = (low <= values[-1]) & (values[-1] <= high)
-    assert np.mean(inside) == pytest.approx(0.95, abs=0.012)
-
-
 def part_of(J: Array, b: Array) -> Array:
     """Information and its product with the estimate, from rows and their values."""
     return np.column_stack([J.T @ J, J.T @ b])
@@ -248,23 +236,6 @@ def test_difference_is_the_increase_of_squares(ranks: list[int]) -> None:
     squares, dof = difference(parts)
     assert squares == pytest.approx(np.sum((J @ together - b) ** 2), rel=1e-9, abs=1e-12)
     assert dof == len(b) - np.linalg.matrix_rank(J)
-
-
-def test_scatter_adds_to_the_covariance_also_of_singular_information() -> None:
-    rng = np.random.default_rng(4)
-    J, estimate, tau2 = rng.normal(size=(3, 3)), rng.normal(size=3), np.diag([0.5, 0.0, 2.0])
-    full = part_of(J, J @ estimate)
-
-    # Information about one direction: its variance grows by the scatter along it.
-    direction = np.array([1.0, 2.0, -1.0])
-    rank_one = part_of(direction[None], np.array([3.0]))
-    found, of_one = with_scatter(np.array([full, rank_one]), tau2)
-    A, vector = found[:, :-1], found[:, -1]
-    expected = np.linalg.inv(J.T @ J) + tau2
-    assert_allclose(np.linalg.inv(A), expected, rtol=1e-9, atol=1e-12)
-    assert_allclose(np.linalg.solve(A, vector), estimate, rtol=1e-8)
-    assert_allclose(of_one * (1.0 + direction @ tau2 @ direction), rank_one, atol=1e-11)
-    assert_array_equal(with_scatter(rank_one, 0.0 * tau2), rank_one)
 
 
 def test_distributions() -> None:

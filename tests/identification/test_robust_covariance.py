@@ -6,7 +6,7 @@ compared with that spread.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import pytest
@@ -197,25 +197,6 @@ def test_estimates_from_single_recordings_are_their_fits() -> None:
     for k in (0, 1, 3):
         assert_allclose(result.each[k], np.linalg.lstsq(X[k], y[k])[0], rtol=1e-6)
     assert np.isnan(result.each[2]).all()
-
-
-def test_units_of_the_unknowns_do_not_matter() -> None:
-    """All deviations and draws scale with units that differ by twenty orders of magnitude."""
-    unit = np.array([1e10, 1.0, 1e-10])
-    X, y = waves(3, 480, 3), noise(0.8, (3, 480), np.random.default_rng(2))
-    _, _, one = Linear(X).assessed(y, 36.0, draws=50)
-    theta, condensed = Linear(X).fitted(y)
-    wide = np.append(unit, 1.0)
-    other = replace(
-        condensed,
-        blocks=condensed.blocks * wide,
-        common_rows=condensed.common_rows * wide,
-    )
-    two = assess(other, theta / unit, 36.0, draws=50)
-    for name in ("sandwich", "each", "draws"):
-        assert_allclose(getattr(two, name) * unit, getattr(one, name), rtol=1e-6)
-    assert_allclose(two.interval.T * unit, one.interval.T, rtol=1e-6)
-    assert len(two.draws) == 50
 
 
 def test_the_interval_is_the_hull() -> None:

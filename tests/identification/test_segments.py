@@ -105,15 +105,6 @@ def test_every_row_is_in_one_segment(task: DesignTask, length: float | None, lea
     assert min(p.samples - min(ahead, p.begin) for p in of_whole) >= MIN_SAMPLES
 
 
-def test_gaps_have_no_segments(task: DesignTask) -> None:
-    """A gap in the rows is longer than a segment."""
-    rows = np.concatenate([np.arange(60), np.arange(140, 201)])
-    recordings = [aligned_log(task, rows=rows)]
-    segments = cut_into_segments(task.system, recordings, 0.2, 0.0)
-    require_rows_covered_once(segments, recordings)
-    assert [p.begin for p in segments] == [0, 20, 40, 140, 160, 180]
-
-
 def test_segments_that_are_too_short_are_refused(task: DesignTask) -> None:
     """The message has the file, the key, its value and the smallest length."""
     with pytest.raises(

@@ -132,7 +132,7 @@ def designed(model: mujoco.MjModel) -> Design:
         ),
         status=Status.MAX_ITERATIONS,
         parameters=("mass", "gear/ratio"),
-        labels=plain_labels(("mass", "gear/ratio"), model.nq, model.nv, model.nu),
+        labels=plain_labels(("mass", "gear/ratio")),
         theta=np.array([2.0, 1.0]),
         initial=evaluated(model, initial, 1.0),
         final=evaluated(model, final, 16.0),

@@ -103,20 +103,11 @@ def ten_iterates() -> tuple[HistoryRow, ...]:
     )
 
 
-def plain_labels(parameters: Sequence[str], nq: int = 0, nv: int = 0, nu: int = 0) -> Labels:
-    """Labels without units, of columns that have numbers."""
-
-    def numbered(word: str, count: int) -> tuple[str, ...]:
-        return tuple(f"{word} {i} [model unit]" for i in range(count))
-
-    return Labels(
-        qpos=numbered("qpos", nq),
-        positions=numbered("position", nv),
-        velocities=numbered("velocity", nv),
-        controls=numbered("control", nu),
-        parameters=tuple(parameters),
-        parameter_units=("",) * len(parameters),
-    )
+def plain_labels(parameters: Sequence[str]) -> Labels:
+    """Labels of parameters without units."""
+    columns = dict.fromkeys(("qpos", "positions", "velocities", "controls"), ())
+    units = ("",) * len(parameters)
+    return Labels(parameters=tuple(parameters), parameter_units=units, **columns)
 
 
 def make_design(dofs: int = 2, count: int = 3) -> Design:
@@ -126,7 +117,7 @@ def make_design(dofs: int = 2, count: int = 3) -> Design:
     return Design(
         status=Status.CONVERGED,
         parameters=names,
-        labels=plain_labels(names, dofs, dofs, 1),
+        labels=make_labels(dofs, count),
         theta=np.linspace(1.0, 2.0, count),
         initial=make_evaluation(dofs, count, 0.1),
         final=make_evaluation(dofs, count, 1.0),
