@@ -20,7 +20,7 @@ from mjfim.model.coordinates import control_names
 from mjfim.plant.active_constraints import saturated_actuators
 from mjfim.records.trajectory import Trajectory
 from tests.support.limits import barrier_check, barrier_problem, excess_of, of_kind
-from tests.support.numerics import make_task
+from tests.support.numerics import TILT, make_task
 
 # A hull that floats, with a mast on a ball joint and an arm on a hinge. The mast is turned by an
 # actuator with three forces, the arm by two actuators on a tendon and by one on its joint.
@@ -76,13 +76,13 @@ def sines(*moved: str, **further: float) -> dict[str, Any]:
 
 def ship_task(folder: Path, text: str | None = None, **tables: Any) -> DesignTask:
     """The ship for 0.2 s, with five engine steps in each sample; everything moves."""
-    turned = np.array([0.9, 0.3, -0.2, 0.1]) / np.linalg.norm([0.9, 0.3, -0.2, 0.1])
+    w, x, y, z = TILT
     defaults = {
         "horizon": 0.2,
         "parameters": {"m": "body/fore:mass"},
         "noise": {"qpos:elbow": 0.01},
         "initial": {
-            "qpos": (0.0, 0.0, 1.0, *turned, *turned[[0, 2, 1, 3]], -0.3),
+            "qpos": (0.0, 0.0, 1.0, w, x, y, z, w, y, x, z, -0.3),
             "qvel": (0.3, -0.1, 0.2, 0.5, -0.4, 0.3, 0.4, -0.8, 0.2, 1.0),
         },
         "control": sines("thrust", "aim[0]", "pull", **{"aim[1]": 0.5, "aim[2]": 0.4}),

@@ -65,7 +65,6 @@ class Pendulum:
     """Swing-up with a quadratic cost, as a problem that keeps every evaluated value.
 
     Attributes:
-        shift: Number that is subtracted from the cost.
         sign: Sign of the gradient of `expand`.
         wall: Size of the torque above which a trial diverges.
         refinements: Number of times that `refine` returns a more accurate point.
@@ -73,7 +72,6 @@ class Pendulum:
         gammas: Every step length that was tried.
     """
 
-    shift: float = 0.0
     sign: float = 1.0
     wall: float = np.inf
     refinements: int = 0
@@ -85,16 +83,16 @@ class Pendulum:
         return Curve(np.array(list(accumulate(u, step, initial=START))), u)
 
     def value(self, point: Curve) -> float:
-        """The quadratic cost, infinite beyond the wall, less the shift."""
+        """The quadratic cost, infinite beyond the wall."""
         d, u = point.x - GOAL, point.u
         running = DT * (np.einsum("ki,ij,kj->", d[:-1], Q, d[:-1]) + R[0, 0] * np.sum(u**2))
         whole = 0.5 * (running + d[-1] @ TERMINAL @ d[-1])
-        self.values.append(whole - self.shift if np.abs(u).max() <= self.wall else np.inf)
+        self.values.append(whole if np.abs(u).max() <= self.wall else np.inf)
         return self.values[-1]
 
     def size(self, point: Curve) -> float:
-        """The cost before `shift` is subtracted."""
-        return self.value(point) + self.shift
+        """The cost itself."""
+        return self.value(point)
 
     def expand(self, point: Curve) -> Expansion:
         """Exact first derivatives."""
@@ -312,17 +310,6 @@ def test_the_line_search_ends_with_its_time_and_the_descent_with_its_last_iterat
 def test_armijo_refuses_settings_that_cannot_work(settings: Any) -> None:
     with pytest.raises(ValueError, match="Armijo needs"):
         Armijo(**settings)
-
-
-@pytest.mark.parametrize("method", DIRECTIONS)
-@pytest.mark.parametrize("share", [0.0, 0.9, 1.0, 1.5])
-def test_a_constant_in_the_cost_does_not_change_the_optimum(
-    method: str, share: float, optimum: float
-) -> None:
-    # share = 1: the cost starts at exactly zero, as a log-determinant may
-    shift = share * Pendulum().value(start(Pendulum()))
-    iterates = run(Pendulum(shift=shift), DIRECTIONS[method](), max_iterations=300)
-    assert iterates[-1].value + shift == pytest.approx(optimum, rel=1e-6)
 
 
 def learned(memory: int, iterations: int = 9) -> tuple[LBFGS, Expansion, Array]:

@@ -150,20 +150,10 @@ def test_json_names_nuisance_parameters_and_priors_and_has_no_nan() -> None:
 
 
 def test_csv_plays_back(folder: Path, design: Design, task: DesignTask) -> None:
-    """design.csv has all digits and named columns, and can be the initial control of a design."""
-    with (folder / "design.csv").open(newline="", encoding="utf-8") as stream:
-        header, *rows = csv.reader(stream)
-    states = ["qpos:slide", "qpos:hinge", "qvel:slide", "qvel:hinge"]
-    assert header == ["t", *states, "ctrl:force", *(f"gain:force:{name}" for name in states)]
-    assert len(rows) == N + 1
-    assert rows[-1][5] == ""
-    curve = design.trajectory
-    assert [float(row[2]) for row in rows] == curve.qpos[:, 1].tolist()
-    assert [float(row[5]) for row in rows[:-1]] == curve.ctrl[:, 0].tolist()
-    again = DesignTask.resolve(
-        task.experiment.replace(initial={"control": str((folder / "design.csv").resolve())})
-    )
-    assert np.array_equal(again.control, curve.ctrl)
+    """It can be the initial control of a design, and has all digits."""
+    file = str((folder / "design.csv").resolve())
+    again = DesignTask.resolve(task.experiment.replace(initial={"control": file}))
+    assert np.array_equal(again.control, design.trajectory.ctrl)
 
 
 # ---- designs that are not

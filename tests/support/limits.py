@@ -15,7 +15,7 @@ from mjfim.excitation.limits.constraints import ConstraintSet, constraint_set_of
 from mjfim.excitation.search.interior_problem import InteriorProblem
 from mjfim.excitation.task import DesignTask
 from tests.fuzz.player import NEAREST, Layout, play
-from tests.support.numerics import Array, cart_task, directional_check, make_task
+from tests.support.numerics import TILT, Array, cart_task, directional_check, make_task
 
 # An arm of two servos on a floating hull: the addresses of positions, velocities, joints and
 # actuators all differ. One servo has an activation state, the other a limited force; one joint
@@ -64,7 +64,6 @@ FLOATING_LIMITS = {
 
 def floating_task(folder: Path, integrator: str = "implicitfast", **tables: Any) -> DesignTask:
     """The floating arm, swinging for 0.3 s with five engine steps in each sample."""
-    tilt = np.array([0.9, 0.3, -0.2, 0.1]) / np.linalg.norm([0.9, 0.3, -0.2, 0.1])
     control = {
         "kind": "sine",
         "amplitude": {"thrust": 4.0, "shoulder": 0.6, "elbow": 0.5},
@@ -77,7 +76,7 @@ def floating_task(folder: Path, integrator: str = "implicitfast", **tables: Any)
         "noise": {"qpos:shoulder": 0.01, "qpos:elbow": 0.01, "qvel:elbow": 0.05},
         "limits": FLOATING_LIMITS,
         "initial": {
-            "qpos": (0.0, 0.0, 1.0, *tilt.tolist(), 0.4, -0.3),
+            "qpos": (0.0, 0.0, 1.0, *TILT, 0.4, -0.3),
             "qvel": (0.1, 0.0, 0.2, 0.5, -0.4, 0.3, 1.0, -2.0),
             "act": (0.1,),
             "control": control,
