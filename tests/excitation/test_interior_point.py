@@ -119,7 +119,7 @@ def test_a_diverged_trial_has_infinite_value(tmp_path: Path) -> None:
     for own in (problem, replace(problem, with_cost=False)):
         point = own.point(1e12 * task.control)
         assert point is DIVERGED_POINT
-        assert own.value(point) == np.inf
+        assert own.value(point) == np.inf and own.reevaluate(point) is point
         for ask in (values_of, own.expand):
             with pytest.raises(ValueError, match="diverged"):
                 ask(point)

@@ -261,6 +261,16 @@ def test_the_size_of_J_of_D_optimality_is_one_nat_per_parameter(tmp_path) -> Non
         assert (point.cost < 0.0) is (criterion == "D")
 
 
+def test_a_diverged_trial_has_infinite_cost_and_no_expansion(tmp_path) -> None:
+    task = cart_task(tmp_path)
+    point, expansion = expansion_of(task, FORWARD_DIFFERENCES)
+    K = np.zeros((task.samples, 1, 4))
+    lost = task.problem.project(point, expansion.lift(K, np.full((task.samples, 1), 9e9)), 1.0, K)
+    assert task.problem.value(lost) == np.inf
+    with pytest.raises(ValueError, match="diverged"):
+        task.problem.expand(lost)
+
+
 def test_refining_keeps_the_trajectory_and_its_cost_and_is_possible_once(tmp_path) -> None:
     task = cart_task(tmp_path)
     point = task.problem.point(task.initial, FORWARD_DIFFERENCES)

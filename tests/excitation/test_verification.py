@@ -52,32 +52,6 @@ def spring_task(folder: Path, joint: str = "", motor: str = "", **tables: Any) -
     return make_task(text, folder, **{**defaults, **tables})
 
 
-def test_limits_hold_between_the_samples_too(tmp_path: Path) -> None:
-    """At every sample the ball is in the middle; between samples it swings."""
-    limits = {
-        "position": {"slide": (-0.1, 0.12)},
-        "velocity": {"slide": (0.9 * SPEED, 2 * SPEED)},
-        "acceleration": 300.0,
-    }
-    task = spring_task(tmp_path, limits=limits)
-    assert np.abs(task.initial.qpos).max() < 0.01
-    assert task.initial.qvel.min() > 0.98 * SPEED
-    found = verify(task, task.initial)
-    assert not found.is_feasible
-    # by hand: a harmonic motion of 10 Hz
-    wanted = {
-        "position": 0.1 - SWING,
-        "velocity": -1.9 * SPEED,
-        "acceleration": 300.0 - 20.0 * np.pi * SPEED,
-    }
-    assert found.margins == pytest.approx(wanted, rel=3e-3)
-    assert found.deviation < SAME_STATE_TOLERANCE
-
-    # Positions at the samples alone would not show it.
-    constraints = constraint_set_of(task)
-    assert constraints.margins(along_control(task, constraints)) == pytest.approx(found.margins)
-
-
 def test_a_clearance_holds_between_the_samples_too(tmp_path: Path) -> None:
     """The wall is 0.19 m from the ball in the middle, and 0.15 m nearer where it turns."""
     task = spring_task(tmp_path, limits={"clearance": 0.1})
