@@ -9,8 +9,10 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from mjfim.errors import ExperimentError
+from mjfim.excitation.limits.constraint_kinds import Magnitude
 from mjfim.excitation.limits.limits import limits_of
 from mjfim.excitation.limits.verification import require_feasible_start, verify, violations_of
 from mjfim.excitation.task import DesignTask
@@ -388,6 +390,22 @@ def test_the_slope_of_all_limits_together_holds_with_every_integrator(
 ) -> None:
     task = ship_task(tmp_path, ship(integrator), limits=EVERY, horizon=0.1).relaxed()
     assert barrier_check(task, 0.05) < 2e-3
+
+
+@pytest.mark.parametrize("is_angle", [False, True])
+def test_the_curvature_of_the_barrier_of_a_norm_is_that_of_differences(is_angle: bool) -> None:
+    """Also at the norm zero and beyond the bound."""
+    magnitude = Magnitude(columns=(0, 1, 2), is_angle=is_angle)
+    share = magnitude.norm_at(0.7)
+    moves = 1e-5 * share * np.eye(3)
+    for norm in (0.0, 1e-6, 0.3, 0.995, 1.2):
+        here = share * norm * np.array([2.0, -1.0, 2.0]) / 3.0
+        found, up, down = (
+            magnitude.barrier(here + each, 0.7, 0.8, delta=0.01, weight=0.5)
+            for each in (0.0, moves, -moves)
+        )
+        bend, size = (up.slope - down.slope) / (2e-5 * share), np.abs(found.curvature).max()
+        assert_allclose(found.curvature, bend, rtol=1e-4, atol=1e-4 * size)
 
 
 def test_every_engine_step_of_the_unmodified_model_is_checked(tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
-from scipy.stats import chi2, f
+from scipy.stats import chi2, f, t
 
 import mjfim
 from mjfim.identification.assessment.recording_comparison import (
@@ -214,6 +214,15 @@ def test_missing_estimates_are_left_out() -> None:
     assert_allclose(found.variance, [0.5, 2.0, np.inf])
     assert_allclose(found.p, [chi2(1).sf(0.5), 1.0, 1.0])
     assert not np.isfinite(found.prediction).any()
+
+
+def test_the_interval_for_another_recording_is_that_of_student() -> None:
+    """With equal variances, whatever the scatter between recordings is."""
+    values = np.array([[1.0], [2.0], [4.0], [7.0]])
+    for variance in (1e-3, 10.0):
+        found = random_effects(values, np.full((4, 1), variance), 1e9)
+        half = t(3).ppf(0.975) * values.std(ddof=1) * np.sqrt(1.25)
+        assert_allclose(found.prediction[0], [3.5 - half, 3.5 + half], rtol=1e-6)
 
 
 def part_of(J: Array, b: Array) -> Array:
