@@ -24,7 +24,7 @@ from mjfim.excitation.search.levels import DescentLevel, bandwidth_basis, regula
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.initial import independent_curves
 from mjfim.optimize.directions import LBFGS, MetricDescent
-from mjfim.optimize.projection_operator import Armijo, Direction, Iterate, Regulator, optimize
+from mjfim.optimize.projection_operator import Direction, Iterate, Regulator, optimize
 from mjfim.optimize.structured_bfgs import StructuredBFGS
 from mjfim.parallel.budget import Budget
 from mjfim.records.design import Status
@@ -247,7 +247,7 @@ class Ground(LimitedLevel):
             start,
             direction,
             regulator_for(self.task),
-            _line_search(budget),
+            budget=budget,
             tolerance=tolerance,
             max_iterations=max(most - done, 0),
         )
@@ -324,7 +324,7 @@ class Ground(LimitedLevel):
             start,
             self.direction(),
             self._regulator,
-            _line_search(budget),
+            budget=budget,
             tolerance=STEERING_TOLERANCE,
             max_iterations=STEERING_ITERATIONS,
         )
@@ -376,7 +376,7 @@ class Ground(LimitedLevel):
             problem.reevaluate(point),
             direction,
             self._regulator,
-            _line_search(budget),
+            budget=budget,
             tolerance=min(barrier.tolerance, Barrier.tolerance),
             max_iterations=min(max_iterations, STAGE_ITERATIONS * (1 + is_last)),
         )
@@ -485,11 +485,6 @@ def _direction_for(level: DescentLevel) -> tuple[Direction, DesignProblem]:
     extended_Q = np.diag(np.concatenate([np.diag(Q), psi_weights]))
     direction = MetricDescent(extended_Q, R, extended_Q, weighs_psi=True)
     return direction, replace(level.problem, extends=True)
-
-
-def _line_search(budget: Budget) -> Armijo:
-    """A line search that ends with its time."""
-    return Armijo(is_over=lambda: budget.exhausted is not None)
 
 
 def _meet(level: DescentLevel, eigenvalues: Array, ratio: float) -> bool:
