@@ -230,9 +230,9 @@ def rehearsed(
         units=tuple(group.unit for group in player.groups),
         unlimited=tuple(group.name for group in player.groups if not group.is_limited),
         unplaced=tuple(group.name for group in player.groups if not group.is_placed),
-        floor=player.floor.height,
-        has_floor=player.floor.is_stated,
-        depth=player.floor.depth,
+        floor=player.floor,
+        has_floor=player.has_floor,
+        depth=player.depth,
         unbraked=dict(Counter(name for part in parts[1:] for name in part.unbraked)),
         steps=steps,
         growth=growth,
@@ -407,6 +407,7 @@ class _RobotPlayer:
         constraints: Constraints of the task.
         limits: The l limits that are checked.
         groups: Joints whose speeds are measured.
+        floor, has_floor, depth: The floor; see `find_floor`.
         plan: (M+1, ns) states of the model at the rows; None before it was played.
         limited: Places of the limits that have paths; a force is clamped.
         shown: The q quantities that have paths: these limits, and positions without a limit.
@@ -469,8 +470,10 @@ class _RobotPlayer:
             )
 
         self.groups = tuple(_speed_groups(task))
-        height = -np.inf if spec.floor == "none" else spec.floor
-        self.floor = find_floor(model, trajectory.state[0, : model.nq], height)
+        stated_floor = -np.inf if spec.floor == "none" else spec.floor
+        self.floor, self.has_floor, self.depth = find_floor(
+            model, trajectory.state[0, : model.nq], stated_floor
+        )
         ignored = [frozenset(pair) for pair in task.experiment.limits.ignored]
         self._distances: GeomDistances | None = None
         with suppress(ExperimentError):
@@ -585,8 +588,7 @@ class _RobotPlayer:
             stops += bool(data.nefc and (data.efc_type == JOINT_AT_STOP).any())
         lowest = moving_heights(model, poses)
         # Above a floor that is assumed, the robot may come as low as it begins.
-        floor = self.floor.height
-        floor = floor if self.floor.is_stated else min(floor, float(lowest[0]))
+        floor = self.floor if self.has_floor else min(self.floor, float(lowest[0]))
         heights = lowest - (floor if np.isfinite(floor) else 0.0)
         nearest = np.nan
         if self._distances is not None:

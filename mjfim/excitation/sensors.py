@@ -88,8 +88,8 @@ def sensors_along(
     """
     outputs, noise, model = task.system.outputs, task.system.noise, task.system.model
     coordinates = task.system.source.coordinates
-    sensor_of = {each.name: (each.name, *each.groups)[-1] for each in coordinates.state}
-    sensor_of |= {each.name: each.sensor for each in coordinates.sensors}
+    measurable = (*coordinates.state, *coordinates.sensors)
+    sensor_of = {each.name: (each.name, *each.groups)[-1] for each in measurable}
     names = np.array([sensor_of[name] for name in outputs.names])
     rows, coarse_rows = noise.whiten(fine.G), noise.whiten(coarse.G)
     is_measured = noise.measured(len(rows) - 1) > 0.0

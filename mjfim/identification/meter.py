@@ -183,7 +183,7 @@ class Meter:
         names = self.system.outputs.names
         first = Recording(t=t, ctrl=ctrl[:-1], y=y, outputs=names, name="stream")
         task = FitTask.of(self.system, [first])
-        self._warnings = tuple(map(str, task.elsewhere))
+        self._warnings = tuple(sentence for sentence, _ in task.elsewhere)
         self._simulation = _Simulation(task.problem())
 
     def _note(self, now: float, std: Array) -> None:
@@ -303,13 +303,15 @@ class _Simulation:
             before = int(np.searchsorted(recording.t, now * dt, side="right")) - 1
             since = np.maximum(recording.t[before:] - now * dt, 0.0)
             held = resample_control(since, recording.ctrl[before:-1], dt)
+            first = curves.samples
             response = curves.advance(held[None, : min(most, stop - now)])
             if response is None:
                 raise SimulationDivergedError(
                     f"the model at the guess diverges {self.time:.3g} s after the first row; with "
                     "segments = SECONDS in [fit], the simulation begins again at measured states"
                 )
-            for found in fit.rows_of_segment(fit.parameters.guess, 0, 0, response):
+            curve = [None if each is None else each[0] for each in response]
+            for found in fit.rows_of_segment(fit.parameters.guess, 0, first, *curve):
                 _, r, J = fit.linearised(found)
                 self._triangle = triangle(np.vstack([self._triangle, np.column_stack([J, r])]))
 

@@ -17,7 +17,7 @@ from mjfim.identification.unknowns import FitUnknowns
 from mjfim.optimize.levenberg_marquardt import UnknownValues
 from mjfim.plant.batch import Rollouts
 from mjfim.plant.outputs import OutputDelay
-from mjfim.plant.plant import MAX_NUMBERS_AT_ONCE, SENSITIVITY_STEP, Response
+from mjfim.plant.plant import MAX_NUMBERS_AT_ONCE, SENSITIVITY_STEP
 from mjfim.plant.running_law import InputContext
 from mjfim.records.trajectory import Trajectory
 
@@ -272,11 +272,14 @@ class SegmentSimulation(FitUnknowns):
             step=batch.step,
             wanted=batch.wanted,
         )
+        first = 0
         for response in responses:
             if response is None:
                 raise DivergedSegmentError
             for place, i in enumerate(batch.segments):
-                yield from self.rows_of_segment(theta, i, place, response)
+                curve = [None if each is None else each[place] for each in response]
+                yield from self.rows_of_segment(theta, i, first, *curve)
+            first += response[0].shape[1] - 1
 
     def initial_state(self, at: UnknownValues, index: int) -> Array:
         """(ns,) state at which a segment begins."""
@@ -300,16 +303,18 @@ class SegmentSimulation(FitUnknowns):
         return recorded[np.clip(places, 0, len(recorded) - 1)]
 
     def rows_of_segment(
-        self, theta: Array, index: int, place: int, response: Response
+        self, theta: Array, index: int, first: int, *simulated: Array | None
     ) -> Iterator[SegmentRows]:
         """Predictions of the rows of a segment inside a simulated interval, if there are any.
 
         Args:
             theta: (p,) parameters of the recording.
             index: Index of the segment.
-            place: Place of the segment in the batch.
-            response: Simulation of the batch over the interval.
+            first: Sample of the segment at which the interval begins.
+            *simulated: (n+1, ny) outputs over the interval and, unless they are None, their
+                derivatives by theta and by directions of the initial state; see `Response`.
         """
+        found = [each for each in simulated if each is not None]
         segment = self.segments[index]
         recording = self.recordings[segment.recording]
 
@@ -319,13 +324,13 @@ class SegmentSimulation(FitUnknowns):
         times = recording.t[segment.rows] / recording.dt - segment.begin - delay / recording.dt
 
         # Rows in this interval; the last interval includes its end.
-        samples = response.y.shape[1] - 1
+        samples = len(found[0]) - 1
         clipped = np.clip(times, 0.0, segment.samples)
-        is_last = response.first + samples >= segment.samples
-        inside = clipped >= response.first
-        inside &= (clipped < response.first + samples) | is_last
+        is_last = first + samples >= segment.samples
+        inside = clipped >= first
+        inside &= (clipped < first + samples) | is_last
         if inside.any():
-            y, *jacobians = self._at_times(response, place, recording, times[inside])
+            y, *jacobians = self._at_times(found, recording, times[inside] - first)
             yield SegmentRows(
                 segment=index,
                 recording=segment.recording,
@@ -335,31 +340,25 @@ class SegmentSimulation(FitUnknowns):
             )
 
     def _at_times(
-        self, response: Response, place: int, recording: AlignedRecording, times: Array
+        self, found: list[Array], recording: AlignedRecording, times: Array
     ) -> list[Array]:
         """(k, ny) outputs of a segment at some times, and their derivatives if there are any.
 
         Args:
-            response: Simulation of a batch over an interval.
-            place: Place of the segment in the batch.
+            found: (n+1, ny) outputs over an interval, and their derivatives if there are any.
             recording: Recording of the segment.
-            times: (k,) times of the rows [samples since the begin of the segment].
+            times: (k,) times of the rows [samples since the begin of the interval].
         """
-        found = [
-            each[place]
-            for each in (response.y, response.common, response.private)
-            if each is not None
-        ]
         delay_derivative = self.parameters.delay_derivative
         is_delayed = bool(delay_derivative.any())
 
         # Rows on the grid are samples of the simulation.
         if recording.on_grid and not is_delayed:
-            sample = np.rint(times).astype(int) - response.first
+            sample = np.rint(times).astype(int)
             return [each[sample] for each in found]
 
         # Other rows are interpolated between the samples; the derivative by the delay is added.
-        interpolation = OutputDelay.at(times - response.first, len(found[0]), recording.dt)
+        interpolation = OutputDelay.at(times, len(found[0]), recording.dt)
         at_times = [interpolation.apply(each) for each in found]
         if is_delayed and len(found) > 1:
             change = interpolation.derivative(found[0])

@@ -30,20 +30,6 @@ URI_SEPARATOR = "://"
 PACKAGE = "package://"
 
 
-@record
-class UrdfSource:
-    """A URDF whose links and joints are bodies and joints of a model.
-
-    Attributes:
-        path: The URDF file.
-        prefixes: What stands before the names of its links and joints in the model, one for each
-            time it is attached.
-    """
-
-    path: Path
-    prefixes: tuple[str, ...]
-
-
 def included_file(main: Path, including: Path, name: str) -> Path | None:
     """Find the file that an `<include>` names.
 
@@ -168,17 +154,19 @@ def is_urdf(path: Path) -> bool:
     return root is not None and root.tag == "robot"
 
 
-def urdf_sources(path: Path) -> tuple[UrdfSource, ...]:
-    """Find the URDFs from which a model comes.
+def urdf_sources(path: Path) -> dict[Path, tuple[str, ...]]:
+    """Find the URDFs whose links and joints are bodies and joints of a model.
 
     Args:
         path: The model file.
 
     Returns:
-        The model itself where it is a URDF; otherwise those that an MJCF attaches.
+        The model itself where it is a URDF; otherwise those that an MJCF attaches. Each has what
+        stands before the names of its links and joints in the model, once for each time that it is
+        attached.
     """
     if is_urdf(path):
-        return (UrdfSource(path=path, prefixes=("",)),)
+        return {path: ("",)}
 
     files: dict[str, Path] = {}
     attachments = []
@@ -192,11 +180,11 @@ def urdf_sources(path: Path) -> tuple[UrdfSource, ...]:
         elif element.tag == "attach" and "model" in element.attrib:
             attachments.append((element.attrib["model"], element.get("prefix", "")))
 
-    found: dict[Path, list[str]] = {}
+    found: dict[Path, tuple[str, ...]] = {}
     for name, prefix in attachments:
         if name in files and is_urdf(files[name]):
-            found.setdefault(files[name], []).append(prefix)
-    return tuple(UrdfSource(path=file, prefixes=tuple(each)) for file, each in found.items())
+            found[files[name]] = (*found.get(files[name], ()), prefix)
+    return found
 
 
 def _root(path: Path) -> Any:

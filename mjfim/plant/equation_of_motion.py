@@ -320,19 +320,9 @@ class ParameterChange:
         )
 
 
-@record
-class MotionPoints:
-    """Points of a motion with their controls.
-
-    Attributes:
-        states: (n, ns) states.
-        acceleration: (n, nv) mean accelerations of the steps that begin there.
-        ctrl: (n, nu) controls.
-    """
-
-    states: Array
-    acceleration: Array
-    ctrl: Array
+# Points of a motion: (n, ns) states, (n, nv) mean accelerations of the steps that begin there, and
+# (n, nu) controls.
+MotionPoints = tuple[Array, Array, Array]
 
 
 @record
@@ -380,7 +370,8 @@ class EquationOfMotion:
             names.append("qDeriv")
         fields = self._fields(model, points, names)
 
-        inertial = (_mass(model, fields["M"]) @ points.acceleration[..., None])[..., 0]
+        _, acceleration, _ = points
+        inertial = (_mass(model, fields["M"]) @ acceleration[..., None])[..., 0]
         inertial += self._implicit_damping(model, fields, points)
         actuation = fields["qfrc_actuator"]
         friction = self._friction(model, points)
@@ -402,7 +393,8 @@ class EquationOfMotion:
             (nv, nv) root mean squares of `M_ij a_j`.
         """
         M = _mass(model, self._fields(model, points, ["M"])["M"])
-        forces = M * points.acceleration[:, None, :]
+        _, acceleration, _ = points
+        forces = M * acceleration[:, None, :]
         return np.asarray(np.sqrt(np.mean(forces**2, axis=0)))
 
     def moments(self, model: Any, points: MotionPoints, actuators: Sequence[int]) -> Array:
@@ -436,7 +428,7 @@ class EquationOfMotion:
             (n, nv) True where such a force acts on a degree of freedom.
         """
         if model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CONSTRAINT:
-            return np.zeros(points.acceleration.shape, dtype=bool)
+            return np.zeros(points[1].shape, dtype=bool)
 
         frictionless = copy.copy(model)
         frictionless.dof_frictionloss[:] = 0.0
@@ -446,27 +438,29 @@ class EquationOfMotion:
 
     def _fields(self, model: Any, points: MotionPoints, names: Sequence[str]) -> dict[str, Array]:
         """MjData fields at the n points, each (n, ...)."""
-        _, found = self.simulator.engine_steps(model, points.states, points.ctrl, names)
+        states, _, ctrl = points
+        _, found = self.simulator.engine_steps(model, states, ctrl, names)
         return {name: values[:, 0] for name, values in found.items()}
 
     def _implicit_damping(
         self, model: Any, fields: dict[str, Array], points: MotionPoints
     ) -> Array:
         """(n, nv) forces `τ B a`."""
+        states, acceleration, _ = points
         timestep = float(model.opt.timestep)
         if "qDeriv" in fields:
             D = _dense(fields["qDeriv"], model.D_rowadr, model.D_rownnz, model.D_colind, model.nv)
-            return -timestep * (D @ points.acceleration[..., None])[..., 0]
+            return -timestep * (D @ acceleration[..., None])[..., 0]
         if model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_EULERDAMP:
-            return np.zeros_like(points.acceleration)
+            return np.zeros_like(acceleration)
 
         # The slope of a damper with a force that is a polynomial of the speed.
-        speed = np.abs(self.simulator.space.split(points.states)[1])
+        speed = np.abs(self.simulator.space.split(states)[1])
         slope = np.broadcast_to(model.dof_damping, speed.shape).copy()
         polynomial = np.reshape(model.dof_dampingpoly, (model.nv, -1))
         for power in range(polynomial.shape[1]):
             slope += (power + 2) * polynomial[:, power] * speed ** (power + 1)
-        return timestep * slope * points.acceleration
+        return timestep * slope * acceleration
 
     def directions(self, speed: Array) -> Array:
         """Directions of dry friction along a motion.
@@ -482,7 +476,7 @@ class EquationOfMotion:
 
     def _friction(self, model: Any, points: MotionPoints) -> Array:
         """(n, nv) forces of dry friction of joints and tendons."""
-        speed = self.simulator.space.split(points.states)[1]
+        speed = self.simulator.space.split(points[0])[1]
         friction = -model.dof_frictionloss * self.directions(speed)
         if not model.tendon_frictionloss.any():
             return np.asarray(friction)

@@ -293,7 +293,7 @@ def _search_at_random(
     settings = _settings(cost)
     count = 1 + counts[0] + counts[1] * settings.nu
     basis, window = bandwidth_basis(task, task.t), task.fade(task.samples)
-    bounds = cost.constraints.control.bounds
+    bounds = cost.level.constraints.control.bounds
     is_bounded = bool(np.isfinite(bounds.lower).all())
     largest = LARGEST_BOUNDED_SCALE if is_bounded else LARGEST_UNBOUNDED_SCALE
     has_weights = bool(task.control_weight.any() or task.tracking.any()) or not task.is_limited
@@ -319,8 +319,8 @@ def _search_at_random(
         if has_weights:
             scale *= SMALLEST_WEIGHTED_SCALE ** (1.0 - numbers[0])
         control = task.centre + scale * deviation
-        values = cost.values(control)
-        is_inside = values is not None and cost.constraints.is_feasible(values)
+        values = cost.level.values(control)
+        is_inside = values is not None and cost.level.constraints.is_feasible(values)
         point = cost.point_along(values) if is_inside or not task.is_limited else None
         J = np.inf if point is None else point.cost
 
@@ -344,7 +344,7 @@ def _settings(cost: LimitedCost) -> ExcitationSettings:
     experiment = task.experiment
     bandwidth = experiment.limits.bandwidth
     fastest = min(bandwidth or np.inf, 0.25 * experiment.rate, MAX_CYCLES / task.horizon)
-    is_smooth = cost.constraints.rate is not None or bandwidth is not None
+    is_smooth = cost.level.constraints.rate is not None or bandwidth is not None
     return ExcitationSettings(
         t=task.t,
         horizon=task.horizon,

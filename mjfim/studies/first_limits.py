@@ -189,7 +189,7 @@ def _clearance(source: ModelSource, positions: Array, least: float) -> dict[str,
         least: The least distance [m].
     """
     model, stated = source.model, {"clearance": least}
-    height = find_floor(model, positions[0]).height
+    height, _, _ = find_floor(model, positions[0])
     height = rounded(height, 6) if abs(height) > ZERO_HEIGHT * least else 0.0
     # A stated floor is a height over z, and that of the rehearsal one against gravity.
     is_upright = model.opt.gravity[2] <= 0.0 and not model.opt.gravity[:2].any()

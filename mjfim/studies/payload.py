@@ -11,6 +11,7 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -49,27 +50,6 @@ FIELDS = ("mass", *AXES, "inertia")
 
 # Keys of a parameter that its earlier estimate replaces.
 REPLACED_KEYS = ("guess", "prior", "cad_prior", "inertial", "coordinates", "scale")
-
-
-@record
-class PayloadPlace:
-    """Place at which a payload is fixed, and sizes of the robot from which its search starts.
-
-    Attributes:
-        body: Name of the body that carries it.
-        term: Name of the term, which no element of the model has.
-        names: Names of its parameters, by field.
-        mass: Mass at which the search starts [kg].
-        centre: (3,) centre of mass at which it starts, in the frame of the body [m].
-        length: Length of the robot, which bounds the centre of mass loosely [m].
-    """
-
-    body: str
-    term: str
-    names: Mapping[str, str]
-    mass: float
-    centre: tuple[float, ...]
-    length: float
 
 
 @record
@@ -159,8 +139,8 @@ class RobotExperiment:
                 tables[parameter] = {**kept, **place, "guess": guess}
         return tables
 
-    def place(self, body: str | None) -> PayloadPlace:
-        """Find the body that carries the payload.
+    def carrier(self, body: str | None) -> str:
+        """Name of the body that carries the payload.
 
         Args:
             body: Its name; None for the one at which the experiment states a payload.
@@ -185,22 +165,12 @@ class RobotExperiment:
         number = identifier(model, "body", body)
         if number < 0:
             raise ExperimentError(f"body: {unknown('body', body, names_of(model, 'body'))}")
-        group = model.body_weldid[number]
-        if group == 0:
+        if model.body_weldid[number] == 0:
             raise ExperimentError(
                 f"body: {body!r} does not move, so that a payload has no effect; valid: "
                 f"{listed(moving)}"
             )
-
-        used = self.values["parameters"]
-        return PayloadPlace(
-            body=body,
-            term=free_name(KIND, {*names_of(model, "body"), *self.values["terms"]}),
-            names={field: free_name(f"payload_{field}", used) for field in FIELDS},
-            mass=PAYLOAD_SHARE * float(model.body_subtreemass[group]),
-            centre=tuple(model.body_ipos[number].tolist()),
-            length=model_length(model),
-        )
+        return body
 
 
 def parameters_of(name: str, spec: ParameterSpec) -> list[tuple[str, str | None]]:
@@ -306,7 +276,7 @@ class PayloadTask:
 
     Attributes:
         robot: The experiment of the robot.
-        place: Where the payload is.
+        body: Name of the body that carries the payload.
         earlier: Earlier estimate of the robot, or None.
         size: Edge of the cube of which the payload has the volume [m], or None.
         threads: Threads for the engine, or None.
@@ -314,7 +284,7 @@ class PayloadTask:
     """
 
     robot: RobotExperiment
-    place: PayloadPlace
+    body: str
     earlier: Estimate | None
     size: float | None
     threads: int | None
@@ -345,7 +315,7 @@ class PayloadTask:
         stated = RobotExperiment.of(experiment)
         task = cls(
             robot=stated,
-            place=stated.place(body),
+            body=stated.carrier(body),
             earlier=robot,
             size=size,
             threads=threads,
@@ -359,6 +329,29 @@ class PayloadTask:
                 f"{listed(known)}. Identify the robot with this experiment"
             )
         return task
+
+    @cached_property
+    def term(self) -> str:
+        """Name of the term, which no element of the model has."""
+        bodies = names_of(model_of(self.robot.stated_by).model, "body")
+        return free_name(KIND, {*bodies, *self.robot.values["terms"]})
+
+    @cached_property
+    def names(self) -> dict[str, str]:
+        """Names of the parameters of the payload, by field."""
+        used = self.robot.values["parameters"]
+        return {field: free_name(f"payload_{field}", used) for field in FIELDS}
+
+    @cached_property
+    def start(self) -> tuple[float, list[float], float]:
+        """Mass [kg] and centre of mass in the frame of the body [m] at which a search starts.
+
+        The last number is the length of the robot [m], which bounds the centre of mass loosely.
+        """
+        model = model_of(self.robot.stated_by).model
+        number = identifier(model, "body", self.body)
+        mass = PAYLOAD_SHARE * float(model.body_subtreemass[model.body_weldid[number]])
+        return mass, model.body_ipos[number].tolist(), model_length(model)
 
     def system(self, known: KnownRobot | None = None) -> System:
         """The robot with the payload.
@@ -491,8 +484,8 @@ class PayloadTask:
         values = {**self.robot.values, "parameters": {**payload, **tables}}
         values["fit"] = {**self.robot.values["fit"], "hold": known.held}
         if payload:
-            term = {"kind": KIND, "body": self.place.body}
-            values["terms"] = {**self.robot.values["terms"], self.place.term: term}
+            term = {"kind": KIND, "body": self.body}
+            values["terms"] = {**self.robot.values["terms"], self.term: term}
 
         system = System.resolve(self.robot.stated_by.restated(values), threads=self.threads)
         if not known.known:
@@ -512,14 +505,15 @@ class PayloadTask:
             values: Values at which the search starts, by field; default: from the robot's sizes.
             inertia: Assumed rotational inertia, known to as much [kg m²]; None where it is free.
         """
-        place = self.place
-        default = {"mass": place.mass, "inertia": place.mass * self._edge(place.mass) ** 2 / 6.0}
-        start = {**default, **dict(zip(AXES, place.centre, strict=True)), **(values or {})}
+        mass, centre, length = self.start
+        inertia_of_cube = mass * self._edge(mass) ** 2 / 6.0
+        start = {"mass": mass, "inertia": inertia_of_cube, **(values or {})}
+        start |= zip(AXES, centre, strict=True)
         tables = {}
-        for field, name in place.names.items():
-            table = {"target": f"term/{place.term}:{field}", "guess": start[field]}
+        for field, name in self.names.items():
+            table = {"target": f"term/{self.term}:{field}", "guess": start[field]}
             if field in AXES:
-                table |= {"guess": place.centre[AXES.index(field)], "prior": place.length}
+                table["prior"] = length
             if field == "inertia" and inertia is not None:
                 table |= {"guess": inertia, "prior": inertia, "nuisance": True}
             tables[name] = table
@@ -530,7 +524,7 @@ class PayloadTask:
         return self.size if self.size is not None else float(np.cbrt(mass / DENSITY))
 
     def _determines_inertia(self, fit: FitResult) -> bool:
-        j = fit.task.system.parameters.names.index(self.place.names["inertia"])
+        j = fit.task.system.parameters.names.index(self.names["inertia"])
         value = float(fit.theta[j])
         half_width = np.abs(fit.accuracy.interval[j] - value).max()
         is_known = np.isfinite(fit.accuracy.std[j]) and value > 0.0
@@ -549,10 +543,10 @@ class PayloadTask:
             search: Its search.
         """
         names = fit.task.system.parameters.names
-        index = {field: names.index(name) for field, name in self.place.names.items()}
+        index = {field: names.index(name) for field, name in self.names.items()}
         high = float(fit.accuracy.interval[index["mass"], 1])
         mass = max(float(fit.theta[index["mass"]]), 0.5 * high if np.isfinite(high) else 0.0)
-        mass = mass or self.place.mass
+        mass = mass or self.start[0]
 
         edge = self._edge(mass)
         inertia = mass * edge**2 / 6.0
@@ -576,12 +570,12 @@ class PayloadTask:
         self, estimate: Estimate, known: KnownRobot, edge: float | None
     ) -> PayloadEstimate:
         """The payload of an estimate."""
-        index = {field: estimate.parameters.index(name) for field, name in self.place.names.items()}
+        index = {field: estimate.parameters.index(name) for field, name in self.names.items()}
         axes = [index[axis] for axis in AXES]
         half_widths = 0.5 * np.diff(estimate.interval[axes], axis=1).ravel()
-        is_determined = half_widths < UNDETERMINED_SHARE * NORMAL_95 * self.place.length
+        is_determined = half_widths < UNDETERMINED_SHARE * NORMAL_95 * self.start[2]
         return PayloadEstimate(
-            body=self.place.body,
+            body=self.body,
             mass=float(estimate.theta[index["mass"]]),
             mass_interval=estimate.interval[index["mass"]],
             centre=estimate.theta[axes],
