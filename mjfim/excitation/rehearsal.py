@@ -740,6 +740,16 @@ class _RobotPlayer:
             return self.rest
         return np.asarray(self.rest + self.gain[0] @ self._deviation(state, 0))
 
+    def _command(self, state: Array, row: int, noise: Array) -> Array:
+        """(nu,) control that the controller sends at a row in a state: (ns,) [u-unit].
+
+        It reads the measured entries with their noise: (ny,).
+        """
+        read = np.flatnonzero(self.sensed >= 0)
+        measured = np.array(state)
+        measured[read] += noise[self.sensed[read]]
+        return self._clipped(self.ctrl[row] + self.gain[row] @ self._deviation(measured, row))
+
     def _fed_back(self, model: Any, start: Array, noise: Array) -> Array:
         """(M, nu) controls that the controller sends to a robot.
 
@@ -752,14 +762,11 @@ class _RobotPlayer:
         data.qpos[:], data.qvel[:], data.act[:] = self.task.space.split(start)
         sent = np.zeros(self.ctrl.shape)
         before = self._before_start(start)
-        read = np.flatnonzero(self.sensed >= 0)
         for step in range(len(sent) * self.steps_per_row):
             row, phase = divmod(step, self.steps_per_row)
             if phase == 0:
                 state = np.concatenate([data.qpos, data.qvel, data.act])
-                state[read] += noise[row, self.sensed[read]]
-                move = self.gain[row] @ self._deviation(state, row)
-                sent[row] = self._clipped(self.ctrl[row] + move)
+                sent[row] = self._command(state, row, noise[row])
             arrived = (step - self.late_steps) // self.steps_per_row
             data.ctrl[:] = before if arrived < 0 else sent[arrived]
             mujoco.mj_step(model, data)

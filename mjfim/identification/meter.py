@@ -136,6 +136,16 @@ class Meter:
         return self.read().std
 
     @one_blas_thread()
+    def _simulate_kept(self, ended: bool) -> None:
+        """Simulate the kept rows, and drop those that are needed no more."""
+        if self._simulation is None:
+            self._begin(ended)
+        if self._simulation is not None:
+            t, ctrl, y = map(np.array, zip(*self._kept, strict=True))
+            self._simulation.advance(t, ctrl, y, ended=ended)
+            self._note(self._simulation.time, self._simulation.std)
+            del self._kept[: max(self._simulation.first_row(t) - KEPT_ROWS, 0)]
+
     def read(self, *, ended: bool = False) -> Watch:
         """Simulate the rows that were added, and return what is known.
 
@@ -152,13 +162,7 @@ class Meter:
             raise RecordingError(
                 f"the stream has too few rows ({self._rows}), not {MIN_ROWS} or more"
             )
-        if self._simulation is None:
-            self._begin(ended)
-        if self._simulation is not None:
-            t, ctrl, y = map(np.array, zip(*self._kept, strict=True))
-            self._simulation.advance(t, ctrl, y, ended=ended)
-            self._note(self._simulation.time, self._simulation.std)
-            del self._kept[: max(self._simulation.first_row(t) - KEPT_ROWS, 0)]
+        self._simulate_kept(ended)
         asked, names = self._asked, self.system.parameters.names
         return Watch(
             parameters=tuple(names[j] for j in asked.tolist()),

@@ -17,7 +17,7 @@ from mjfim.identification.unknowns import FitUnknowns
 from mjfim.optimize.levenberg_marquardt import UnknownValues
 from mjfim.plant.batch import Rollouts
 from mjfim.plant.outputs import OutputDelay
-from mjfim.plant.plant import MAX_NUMBERS_AT_ONCE, SENSITIVITY_STEP
+from mjfim.plant.plant import MAX_NUMBERS_AT_ONCE, SENSITIVITY_STEP, Response
 from mjfim.plant.running_law import InputContext
 from mjfim.records.trajectory import Trajectory
 
@@ -195,6 +195,15 @@ class SegmentSimulation(FitUnknowns):
             [plant.model(theta)], start, inputs[:, lead:], context=context
         )
 
+    def _differences(self, directions: int) -> tuple[bool, float]:
+        """Whether differences along some directions are two-sided, and their relative step."""
+        # Two-sided differences are more accurate; with much data they take too long.
+        central = self.central
+        if central is None:
+            central = self.sample_count * 2 * directions < SAMPLES_FOR_ONE_SIDED
+        factor = 1.0 if central else ONE_SIDED_STEP_FACTOR
+        return central, factor * self.difference_step
+
     def batches(
         self,
         *,
@@ -214,14 +223,8 @@ class SegmentSimulation(FitUnknowns):
         if wanted is None:
             wanted = self.estimated
 
-        # Two-sided differences are more accurate; with much data they take too long.
         directions = int(wanted.sum()) + self.private_count
-        central, step = self.central, self.difference_step
-        if central is None:
-            central = self.sample_count * 2 * directions < SAMPLES_FOR_ONE_SIDED
-        if not central:
-            step = ONE_SIDED_STEP_FACTOR * step
-
+        central, step = self._differences(directions)
         simulations = 1 + derivatives * directions * (1 + central)
 
         # The states of a batch have to fit into memory.
@@ -257,11 +260,26 @@ class SegmentSimulation(FitUnknowns):
         Raises:
             DivergedSegmentError: A simulation diverges.
         """
-        theta = self.theta_of_recording(at, batch.recording)
+        theta, first = self.theta_of_recording(at, batch.recording), 0
+        for response in self._responses(at, batch, theta):
+            if response is None:
+                raise DivergedSegmentError
+            for place, i in enumerate(batch.segments):
+                curve = [None if each is None else each[place] for each in response]
+                yield from self.rows_of_segment(theta, i, first, *curve)
+            first += response[0].shape[1] - 1
+
+    def _responses(
+        self, at: UnknownValues, batch: SegmentBatch, theta: Array
+    ) -> Iterator[Response | None]:
+        """Responses of a batch with the parameters theta, (p,), over one interval after the other.
+
+        None where a simulation diverges.
+        """
         longest = max(self.segments[i].samples for i in batch.segments)
         lead = self.system.plant.lead(theta)
         begins = np.array([self.segments[i].begin for i in batch.segments])
-        responses = self.system.plant.derivatives.responses(
+        return self.system.plant.derivatives.responses(
             theta,
             np.stack([self.initial_state(at, i) for i in batch.segments]),
             np.stack([self._control(i, longest, lead) for i in batch.segments]),
@@ -272,14 +290,6 @@ class SegmentSimulation(FitUnknowns):
             step=batch.step,
             wanted=batch.wanted,
         )
-        first = 0
-        for response in responses:
-            if response is None:
-                raise DivergedSegmentError
-            for place, i in enumerate(batch.segments):
-                curve = [None if each is None else each[place] for each in response]
-                yield from self.rows_of_segment(theta, i, first, *curve)
-            first += response[0].shape[1] - 1
 
     def initial_state(self, at: UnknownValues, index: int) -> Array:
         """(ns,) state at which a segment begins."""

@@ -148,6 +148,17 @@ class FitUnknowns:
                     columns += [column] * (not np.isin(j, whole))
         return np.unique(np.array(columns, dtype=np.intp))
 
+    def _last_possible(self, theta: Array, j: int, inside: float) -> float:
+        """Last value of parameter j that is possible, between one inside and that of theta."""
+        theta, end = np.array(theta), theta[j]
+        for _ in range(HALVINGS_TO_BOUND):
+            theta[j] = middle = 0.5 * (inside + end)
+            if self.system.impossible(theta):
+                end = middle
+            else:
+                inside = middle
+        return inside
+
     def bounds_at(self, at: UnknownValues) -> tuple[Array, Array]:
         """Bounds of each common unknown where the others stay: the stated ones and physical ones.
 
@@ -167,15 +178,8 @@ class FitUnknowns:
                 if not np.isfinite(end):
                     end = inside + sign * LARGEST_MOVE * self.parameters.magnitude[j]
                 theta[j] = end
-                if not self.system.impossible(theta):
-                    continue
-                for _ in range(HALVINGS_TO_BOUND):
-                    theta[j] = middle = 0.5 * (inside + end)
-                    if self.system.impossible(theta):
-                        end = middle
-                    else:
-                        inside = middle
-                bounds[side, column] = inside
+                if self.system.impossible(theta):
+                    bounds[side, column] = self._last_possible(theta, j, inside)
         return bounds[0], bounds[1]
 
     @property

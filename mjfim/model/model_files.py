@@ -172,18 +172,18 @@ def urdf_sources(path: Path) -> dict[Path, tuple[str, ...]]:
     attachments = []
     for including, element in elements_of(path):
         if element.tag == "model" and "file" in element.attrib:
-            file = included_file(path, including, element.attrib["file"])
-            root = None if file is None else _root(file)
-            if file is not None and root is not None:
+            included = included_file(path, including, element.attrib["file"])
+            if included is not None and (root := _root(included)) is not None:
                 # Without a stated name, a model has the one in its file.
-                files[element.get("name", root.get("name", ""))] = file
+                files[element.get("name", root.get("name", ""))] = included
         elif element.tag == "attach" and "model" in element.attrib:
             attachments.append((element.attrib["model"], element.get("prefix", "")))
 
     found: dict[Path, tuple[str, ...]] = {}
     for name, prefix in attachments:
-        if name in files and is_urdf(files[name]):
-            found[files[name]] = (*found.get(files[name], ()), prefix)
+        file = files.get(name)
+        if file is not None and is_urdf(file):
+            found[file] = (*found.get(file, ()), prefix)
     return found
 
 

@@ -89,13 +89,7 @@ class AffineForces:
             ctrl: (nu,) control about which it is moved.
             sizes: (2 nv + nu,) sizes of the coordinates.
         """
-        # A copy of a model with many meshes takes time.
-        unlimited = model
-        if model.actuator_forcelimited.any() or model.actuator_ctrllimited.any():
-            unlimited = copy.copy(model)
-            unlimited.actuator_forcelimited[:] = 0
-            unlimited.actuator_ctrllimited[:] = 0
-
+        unlimited = _without_limits(model)
         moves = RELATIVE_MOVE * sizes
         about = np.concatenate([state, ctrl])
         points = about + np.concatenate([np.zeros((1, len(moves))), np.diag(moves)])
@@ -536,3 +530,14 @@ def _dense(values: Array, starts: Any, counts: Any, columns: Any, width: int) ->
         entries = slice(start, start + count)
         dense[:, row, columns[entries]] = values[:, entries]
     return dense
+
+
+def _without_limits(model: Any) -> Any:
+    """The model without limits of controls and of forces of actuators."""
+    # A copy of a model with many meshes takes time.
+    if not (model.actuator_forcelimited.any() or model.actuator_ctrllimited.any()):
+        return model
+    unlimited = copy.copy(model)
+    unlimited.actuator_forcelimited[:] = 0
+    unlimited.actuator_ctrllimited[:] = 0
+    return unlimited

@@ -433,6 +433,14 @@ def _columns(by_move: Array, is_moved: np.ndarray, lumped: LumpedParameters | No
     return full if lumped is None else lumped.expanded(full[..., lumped.base])
 
 
+def _unit_directions(directions: Array) -> Array:
+    """(p, k) directions with a length of 1, without entries that are round-off."""
+    # A parameter that takes part in a direction by round-off only does not take part in it.
+    largest = np.abs(directions).max(axis=0)
+    relative = np.where(np.abs(directions) > ROUND_OFF * largest, directions, 0.0)
+    return np.asarray(relative / np.linalg.norm(relative, axis=0))
+
+
 @record
 class LumpedParameters:
     """Parameters that are lumped into others.
@@ -468,11 +476,7 @@ class LumpedParameters:
         if not k:
             return None
 
-        # A parameter that takes part in a direction by round-off only does not take part in it.
-        relative = directions / size[:, None]
-        largest = np.abs(relative).max(axis=0)
-        relative = np.where(np.abs(relative) > ROUND_OFF * largest, relative, 0.0)
-        unit = relative / np.linalg.norm(relative, axis=0)
+        unit = _unit_directions(directions / size[:, None])
         _, triangle, pivots = scipy.linalg.qr(unit.T, mode="economic", pivoting=True)
         diagonal = np.abs(np.diag(triangle))
         if not diagonal[k - 1] > LEAST_PIVOT_RATIO * diagonal[0]:

@@ -125,6 +125,12 @@ def schroeder_phases(power: Array) -> Array:
     return -2.0 * np.pi * np.concatenate([[0.0], np.cumsum(np.cumsum(power / power.sum()))[:-1]])
 
 
+def harmonic_orders(highest: float, share: float) -> Array:
+    """Orders of a share of the harmonics up to a highest order; at least two of several."""
+    most = min(MAX_HARMONICS, max(int(highest), 1))
+    return np.arange(1, 1 + max(round(most * share), min(2, most)))
+
+
 def multisine(settings: ExcitationSettings, z: Array) -> Array:
     """A sum of harmonics with Schroeder phases for every actuator.
 
@@ -142,9 +148,7 @@ def multisine(settings: ExcitationSettings, z: Array) -> Array:
         base *= (0.5 * highest / base) ** z[0]
     amplitude, delay = z[3:].reshape(2, settings.nu)
 
-    most = min(MAX_HARMONICS, max(int(settings.max_frequency / base), 1))
-    count = max(round(most * z[1]), min(2, most))
-    order = np.arange(1, 1 + count)
+    order = harmonic_orders(settings.max_frequency / base, z[1])
     power = order ** (-2.0 * MAX_ROLL_OFF * z[2])
 
     delayed = settings.t[:, None, None] - (delay / base)[:, None]

@@ -163,7 +163,7 @@ def _widened(model: Any, positions: Array, lengths: Array) -> dict[str, Any]:
 
     A stop is soft: where the start is outside, the range is widened by some times the excess.
     """
-    found: dict[str, dict[str, list[float]]] = {}
+    found: dict[str, Any] = {}
     for limit in limits_of_model(model):
         if limit.kind not in SOFT_KINDS or limit.is_magnitude:
             continue
@@ -171,11 +171,10 @@ def _widened(model: Any, positions: Array, lengths: Array) -> dict[str, Any]:
         ends = np.array([limit.lower, limit.upper])
         excess = np.array([min(values.min() - ends[0], 0.0), max(values.max() - ends[1], 0.0)])
         most = SOFT_SHARE * (ends[1] - ends[0])
-        begins_outside = not limit.lower <= values[0] <= limit.upper
-        if begins_outside and (np.abs(excess) < most).all():
+        if not limit.lower <= values[0] <= limit.upper and (np.abs(excess) < most).all():
             wider = ends + np.clip(SOFT_ROOM * excess, -most, most)
             found.setdefault(limit.kind, {})[limit.name] = [rounded(end, 6) for end in wider]
-    return {**found}
+    return found
 
 
 def _clearance(source: ModelSource, positions: Array, least: float) -> dict[str, Any]:

@@ -185,9 +185,7 @@ def stated_experiment(experiment: Experiment) -> StatedExperiment:
     """
     system = System.resolve(experiment)
 
-    missing = []
-    if experiment.horizon is None:
-        missing.append("horizon")
+    missing = ["horizon"] if experiment.horizon is None else []
     if experiment.initial.control is None and system.controls:
         missing.append("initial.control")
 

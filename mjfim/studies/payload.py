@@ -9,7 +9,7 @@ prior knowledge with its covariance, so that the uncertainty of the robot is par
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 from typing import Any
@@ -80,19 +80,7 @@ class RobotExperiment:
         """
         values = experiment.model_dump(exclude_unset=True)
         loads = {name: spec for name, spec in experiment.terms.items() if spec.kind == KIND}
-        prefixes = tuple(f"term/{name}:" for name in loads)
-
-        gone = set()
-        for name, spec in experiment.parameters.items():
-            of_load = [target.path.startswith(prefixes) for target in spec.all_targets]
-            if any(of_load):
-                if not all(of_load):
-                    raise ExperimentError(
-                        f"{experiment.source}: parameters.{name}: sets numbers of the payload and "
-                        "of the robot; separate the two"
-                    )
-                gone.add(name)
-
+        gone = set(_parameters_of_terms(experiment, loads))
         values["terms"] = {k: v for k, v in values.get("terms", {}).items() if k not in loads}
         parameters = {k: v for k, v in values["parameters"].items() if k not in gone}
         # Values that differ from recording to recording remain a nuisance.
@@ -171,6 +159,24 @@ class RobotExperiment:
                 f"{listed(moving)}"
             )
         return body
+
+
+def _parameters_of_terms(experiment: Experiment, terms: Iterable[str]) -> Iterator[str]:
+    """Names of the tables of parameters that set numbers of some terms.
+
+    Raises:
+        ExperimentError: A parameter sets numbers of a term and of the robot.
+    """
+    prefixes = tuple(f"term/{name}:" for name in terms)
+    for name, spec in experiment.parameters.items():
+        of_terms = [target.path.startswith(prefixes) for target in spec.all_targets]
+        if any(of_terms) and not all(of_terms):
+            raise ExperimentError(
+                f"{experiment.source}: parameters.{name}: sets numbers of the payload and "
+                "of the robot; separate the two"
+            )
+        if any(of_terms):
+            yield name
 
 
 def parameters_of(name: str, spec: ParameterSpec) -> list[tuple[str, str | None]]:
@@ -384,9 +390,8 @@ class PayloadTask:
 
             # First with any inertia, which needs to be known only where recordings show it.
             begin_stage("fitting the payload")
-            system = self.system(known)
             budget = Budget(stop=token)
-            task = FitTask.of(system, recordings)
+            task = FitTask.of(self.system(known), recordings)
             search = FitSearch(task=task, budget=budget, callback=callback)
             fit, edge = fit_task(search), None
             if not self._determines_inertia(fit) and not token.requested:
@@ -394,10 +399,13 @@ class PayloadTask:
             estimate = estimate_from(fit, budget, refuted=())
 
         system = fit.task.system
-        payload = self._payload(estimate, known, edge)
-        seconds = time.perf_counter() - begun
-        steps = system.plant.engine_steps
-        return replace(estimate, payload=payload, seconds=seconds, steps=steps), system
+        found = replace(
+            estimate,
+            payload=self._payload(estimate, known, edge),
+            seconds=time.perf_counter() - begun,
+            steps=system.plant.engine_steps,
+        )
+        return found, system
 
     # ---- the robot
 
@@ -530,6 +538,12 @@ class PayloadTask:
         is_known = np.isfinite(fit.accuracy.std[j]) and value > 0.0
         return bool(is_known and half_width <= DETERMINED_SHARE * value)
 
+    def _plausible_mass(self, fit: FitResult, j: int) -> float:
+        """Mass of the payload, parameter j of a fit, not too small for its interval [kg]."""
+        high = float(fit.accuracy.interval[j, 1])
+        mass = max(float(fit.theta[j]), 0.5 * high if np.isfinite(high) else 0.0)
+        return mass or self.start[0]
+
     def _with_assumed_inertia(
         self, known: KnownRobot, fit: FitResult, search: FitSearch
     ) -> tuple[FitResult, float]:
@@ -544,10 +558,7 @@ class PayloadTask:
         """
         names = fit.task.system.parameters.names
         index = {field: names.index(name) for field, name in self.names.items()}
-        high = float(fit.accuracy.interval[index["mass"], 1])
-        mass = max(float(fit.theta[index["mass"]]), 0.5 * high if np.isfinite(high) else 0.0)
-        mass = mass or self.start[0]
-
+        mass = self._plausible_mass(fit, index["mass"])
         edge = self._edge(mass)
         inertia = mass * edge**2 / 6.0
         values = {field: float(fit.theta[j]) for field, j in index.items()}

@@ -236,9 +236,7 @@ class InsideSearch:
             patience: Number of changes without clear progress after which the search ends.
         """
         while self._untried and budget.exhausted is None:
-            bandwidth = self._untried.popleft()
-            proposed = self._proposed(best, bandwidth, budget)
-            found = self._repeatable(proposed, best)
+            found = self._repeatable(self._proposed(best, self._untried.popleft(), budget), best)
             if found is not None:
                 best = found
                 yield best
@@ -248,8 +246,10 @@ class InsideSearch:
         while without_progress < patience and budget.exhausted is None:
             # Bandwidths that have led to improvements are tried more often.
             choice = int(self._rng.choice(len(BANDWIDTHS), p=successes / successes.sum()))
-            changed = self._changed(best, BANDWIDTHS[choice], size)
-            found = self._repeatable(self.largest(best.about, changed, budget), best)
+            found = self._repeatable(
+                self.largest(best.about, self._changed(best, BANDWIDTHS[choice], size), budget),
+                best,
+            )
             if found is None:
                 size = max(size * AFTER_FAILURE, SMALLEST_SIZE)
                 without_progress += 1

@@ -372,15 +372,18 @@ class Search:
         barrier = rung.barrier
         if barrier is None or len(rows) < 2 or np.isinf(self.budget.seconds_left):
             return rung
-        ratio = self.grounds.stated.engine_steps / level.engine_steps
-        each = ratio * (rows[-1].seconds - rows[0].seconds) / (len(rows) - 1)
+        each = (
+            self.grounds.stated.engine_steps
+            / level.engine_steps
+            * (rows[-1].seconds - rows[0].seconds)
+            / (len(rows) - 1)
+        )
         iterations = self.budget.seconds_left / len(batch) / max(each, 1e-9)
         stages = max(int(iterations / ITERATIONS_OF_A_STAGE), 1)
         if stages >= len(barrier.weights):
             return rung
-        last = barrier.first / MU_FACTOR ** (stages - 1)
-        short = replace(barrier, last=max(last, barrier.last), relaxation=Barrier.relaxation)
-        return replace(rung, barrier=short)
+        last = max(barrier.first / MU_FACTOR ** (stages - 1), barrier.last)
+        return replace(rung, barrier=replace(barrier, last=last, relaxation=Barrier.relaxation))
 
     # ---- random changes
 

@@ -66,14 +66,13 @@ def inertia_combinations(
         return None
 
     # Other parameters are estimated as well, so that their uncertainty counts.
-    others = np.setdiff1d(np.flatnonzero(is_shared), columns)
-    kept = np.concatenate([columns, others])
-    stated = parameters.prior_information[np.ix_(kept, kept)]
-    about = marginal(data[np.ix_(kept, kept)], stated, np.arange(len(columns)))
+    kept = np.concatenate([columns, np.setdiff1d(np.flatnonzero(is_shared), columns)])
+    both = np.ix_(kept, kept)
+    about = marginal(data[both], parameters.prior_information[both], np.arange(len(columns)))
 
     # Eigenvalues of the information relative to the prior do not depend on the coordinates.
-    information = cad_information(bodies, theta)[np.ix_(columns, columns)]
-    known, scale = scaled_to_unit_diagonal(information)
+    own = np.ix_(columns, columns)
+    known, scale = scaled_to_unit_diagonal(cad_information(bodies, theta)[own])
     ratios, vectors = scipy.linalg.eigh(about / np.outer(scale, scale), known)
     left = 1.0 / np.sqrt(1.0 + np.maximum(ratios, 0.0))
     return columns, left <= DETERMINED_SHARE, vectors / scale[:, None]

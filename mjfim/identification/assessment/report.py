@@ -32,6 +32,7 @@ from mjfim.identification.left_out import predict_unfitted
 from mjfim.identification.linear_coordinates import cad_bodies, cad_information
 from mjfim.identification.search import values_of_start
 from mjfim.model.parameters import ParameterSet
+from mjfim.optimize.levenberg_marquardt import UnknownValues
 from mjfim.parallel.budget import Budget
 from mjfim.plant.outputs import Noise
 from mjfim.recordings.checks import plausibility_remarks
@@ -266,6 +267,15 @@ def _residual_forces(result: FitResult) -> tuple[ResidualForce, ...]:
         return ()
 
 
+def _nearly_unphysical(problem: FitProblem, at: UnknownValues) -> np.ndarray:
+    """Parameters near a bound at which an inertia is no longer that of a body."""
+    lower, upper = problem.bounds_at(at)
+    values = problem.common_values(at)
+    near = np.minimum(values - lower, upper - values) < PHYSICAL_TOLERANCE * np.abs(values)
+    near &= (lower > problem.lower) | (upper < problem.upper)
+    return np.asarray(problem.parameter_of_column[near])
+
+
 def _at_bounds(result: FitResult) -> tuple[tuple[str, ...], bool]:
     """Names of the parameters at a bound or beyond it, and whether any is beyond.
 
@@ -276,12 +286,7 @@ def _at_bounds(result: FitResult) -> tuple[tuple[str, ...], bool]:
     tolerance = BOUND_TOLERANCE * parameters.magnitude
     distance = np.minimum(theta - parameters.lower, parameters.upper - theta)
     is_beyond = bool((distance < -tolerance).any())
-    problem, at = result.problem, result.solution.unknowns
-    lower, upper = problem.bounds_at(at)
-    values = problem.common_values(at)
-    near = np.minimum(values - lower, upper - values) < PHYSICAL_TOLERANCE * np.abs(values)
-    near &= (lower > problem.lower) | (upper < problem.upper)
-    distance[problem.parameter_of_column[near]] = 0.0
+    distance[_nearly_unphysical(result.problem, result.solution.unknowns)] = 0.0
     at_bound = np.flatnonzero(distance < tolerance)
     names = tuple(parameters.names[j] for j in at_bound if parameters.names[j] not in held)
     return names, is_beyond

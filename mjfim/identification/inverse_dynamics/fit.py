@@ -216,14 +216,13 @@ class EquationSearch:
             yield np.clip(moved, self.parameters.lower, self.parameters.upper), True
 
         # Other values of the parameters that are no inertias of whole bodies.
-        plain = np.isin(np.arange(len(self.start)), self.active)
-        for body in self.coordinates.bodies:
-            plain[body.columns] = False
+        of_bodies = columns_of(self.coordinates.bodies)
+        plain = np.setdiff1d(self.active, of_bodies)
         rng = np.random.default_rng(0)
         points = sum(len(each.motion.t) for each in self.equations.recorded)
         evaluations = points * (len(self.active) + 1) * USUAL_LINEARISATIONS
         for _ in range(int(min(OTHER_STARTS, MOST_EVALUATIONS / evaluations))):
-            factor = LARGEST_FACTOR ** rng.uniform(-1.0, 1.0, int(plain.sum()))
+            factor = LARGEST_FACTOR ** rng.uniform(-1.0, 1.0, len(plain))
             start = np.array(self.start)
             start[plain] *= factor
             yield np.clip(start, self.parameters.lower, self.parameters.upper), False
