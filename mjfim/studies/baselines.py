@@ -125,7 +125,7 @@ def schroeder_phases(power: Array) -> Array:
     return -2.0 * np.pi * np.concatenate([[0.0], np.cumsum(np.cumsum(power / power.sum()))[:-1]])
 
 
-def harmonic_orders(highest: float, share: float) -> Array:
+def harmonic_orders(highest: float, share: float) -> np.ndarray:
     """Orders of a share of the harmonics up to a highest order; at least two of several."""
     most = min(MAX_HARMONICS, max(int(highest), 1))
     return np.arange(1, 1 + max(round(most * share), min(2, most)))

@@ -409,7 +409,7 @@ def _load_size(model: Any, mass: float, length: float, period: float) -> float:
     if gravity > 0.0 and model.nu:
         torques = _strengths(model, period) * np.where(translations(model), length, 1.0)
         size = max(size, STRENGTH_SHARE * torques.max() / (gravity * length))
-    return size
+    return float(size)
 
 
 def _payload(model: Any, name: str, length: float, period: float) -> Iterator[Candidate]:
