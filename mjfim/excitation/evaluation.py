@@ -6,7 +6,7 @@ whether a design can begin. The evaluation of a finished design gives its warnin
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -395,6 +395,17 @@ def designable(task: DesignTask) -> Identifiability:
     return identifiability
 
 
+def _without_effect(silent: Sequence[str], tried: str) -> UnidentifiableError:
+    """The error of parameters without any effect along the motions that were tried."""
+    quoted = listed([f"parameters.{name}" for name in silent])
+    is_one = len(silent) == 1
+    return UnidentifiableError(
+        f"{quoted} {'changes' if is_one else 'change'} nothing in the measured "
+        f"outputs, neither along the initial {tried} nor along {PROBES} random {tried}s; "
+        f"remove {'it' if is_one else 'them'}, or measure a quantity that shows the effect"
+    )
+
+
 def require_designable(task: DesignTask, identifiability: Identifiability) -> None:
     """Require that every parameter has an effect, and that the initial control excites it.
 
@@ -414,17 +425,9 @@ def require_designable(task: DesignTask, identifiability: Identifiability) -> No
     parameters = task.parameters
     estimated = [parameters.parameters[j] for j in parameters.interest]
 
-    # Parameters without any effect.
-    tried = "control" if task.release is None else "release"
     silent = [estimated[i].name for i in along_all.silent if not estimated[i].group]
     if silent:
-        quoted = listed([f"parameters.{name}" for name in silent])
-        raise UnidentifiableError(
-            f"{quoted} {'changes' if len(silent) == 1 else 'change'} nothing in the measured "
-            f"outputs, neither along the initial {tried} nor along {PROBES} random {tried}s; "
-            f"remove {'it' if len(silent) == 1 else 'them'}, or measure a quantity that shows the "
-            "effect"
-        )
+        raise _without_effect(silent, "control" if task.release is None else "release")
 
     # A criterion that asks for combinations that cannot be identified.
     if task.contrast is not None:

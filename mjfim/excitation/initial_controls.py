@@ -44,6 +44,15 @@ MOST_RANDOM_AMPLITUDE = 6.0
 GIVEN = "given control"
 
 
+def _previous_designs(task: DesignTask) -> Iterator[Candidate]:
+    """The controls of earlier designs that `[descent]` states."""
+    for path in dict.fromkeys(task.experiment.descent.previous):
+        # A shorter design is repeated.
+        with opened(task.experiment, path) as file:
+            control = read_control(file, task.t, task.dt, task.controls, repeat=True)
+        yield Candidate(name=f"previous design {path}", control=control)
+
+
 def initial_controls_of(task: DesignTask, given: Array | None) -> Iterator[Candidate]:
     """Collect the controls from which a design starts.
 
@@ -64,12 +73,7 @@ def initial_controls_of(task: DesignTask, given: Array | None) -> Iterator[Candi
     if given is not None:
         first = Candidate(name=GIVEN, control=given)
 
-    found = [first]
-    for path in dict.fromkeys(descent.previous):
-        # A shorter design is repeated.
-        with opened(task.experiment, path) as file:
-            control = read_control(file, task.t, task.dt, task.controls, repeat=True)
-        found.append(Candidate(name=f"previous design {path}", control=control))
+    found = [first, *_previous_designs(task)]
 
     # Fourier series and multisines share one source of random numbers, in this order.
     rng = np.random.default_rng(descent.seed)

@@ -230,9 +230,9 @@ def rehearsed(
         units=tuple(group.unit for group in player.groups),
         unlimited=tuple(group.name for group in player.groups if not group.is_limited),
         unplaced=tuple(group.name for group in player.groups if not group.is_placed),
-        floor=player.floor.height,
-        has_floor=player.floor.is_stated,
-        depth=player.floor.depth,
+        floor=player.floor,
+        has_floor=player.has_floor,
+        depth=player.depth,
         unbraked=dict(Counter(name for part in parts[1:] for name in part.unbraked)),
         steps=steps,
         growth=growth,
@@ -407,6 +407,7 @@ class _RobotPlayer:
         constraints: Constraints of the task.
         limits: The l limits that are checked.
         groups: Joints whose speeds are measured.
+        floor, has_floor, depth: The floor; see `find_floor`.
         plan: (M+1, ns) states of the model at the rows; None before it was played.
         limited: Places of the limits that have paths; a force is clamped.
         shown: The q quantities that have paths: these limits, and positions without a limit.
@@ -469,8 +470,10 @@ class _RobotPlayer:
             )
 
         self.groups = tuple(_speed_groups(task))
-        height = -np.inf if spec.floor == "none" else spec.floor
-        self.floor = find_floor(model, trajectory.state[0, : model.nq], height)
+        stated_floor = -np.inf if spec.floor == "none" else spec.floor
+        self.floor, self.has_floor, self.depth = find_floor(
+            model, trajectory.state[0, : model.nq], stated_floor
+        )
         ignored = [frozenset(pair) for pair in task.experiment.limits.ignored]
         self._distances: GeomDistances | None = None
         with suppress(ExperimentError):
@@ -585,8 +588,7 @@ class _RobotPlayer:
             stops += bool(data.nefc and (data.efc_type == JOINT_AT_STOP).any())
         lowest = moving_heights(model, poses)
         # Above a floor that is assumed, the robot may come as low as it begins.
-        floor = self.floor.height
-        floor = floor if self.floor.is_stated else min(floor, float(lowest[0]))
+        floor = self.floor if self.has_floor else min(self.floor, float(lowest[0]))
         heights = lowest - (floor if np.isfinite(floor) else 0.0)
         nearest = np.nan
         if self._distances is not None:
@@ -738,6 +740,16 @@ class _RobotPlayer:
             return self.rest
         return np.asarray(self.rest + self.gain[0] @ self._deviation(state, 0))
 
+    def _command(self, state: Array, row: int, noise: Array) -> Array:
+        """(nu,) control that the controller sends at a row in a state: (ns,) [u-unit].
+
+        It reads the measured entries with their noise: (ny,).
+        """
+        read = np.flatnonzero(self.sensed >= 0)
+        measured = np.array(state)
+        measured[read] += noise[self.sensed[read]]
+        return self._clipped(self.ctrl[row] + self.gain[row] @ self._deviation(measured, row))
+
     def _fed_back(self, model: Any, start: Array, noise: Array) -> Array:
         """(M, nu) controls that the controller sends to a robot.
 
@@ -750,14 +762,11 @@ class _RobotPlayer:
         data.qpos[:], data.qvel[:], data.act[:] = self.task.space.split(start)
         sent = np.zeros(self.ctrl.shape)
         before = self._before_start(start)
-        read = np.flatnonzero(self.sensed >= 0)
         for step in range(len(sent) * self.steps_per_row):
             row, phase = divmod(step, self.steps_per_row)
             if phase == 0:
                 state = np.concatenate([data.qpos, data.qvel, data.act])
-                state[read] += noise[row, self.sensed[read]]
-                move = self.gain[row] @ self._deviation(state, row)
-                sent[row] = self._clipped(self.ctrl[row] + move)
+                sent[row] = self._command(state, row, noise[row])
             arrived = (step - self.late_steps) // self.steps_per_row
             data.ctrl[:] = before if arrived < 0 else sent[arrived]
             mujoco.mj_step(model, data)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import partial
 
 import numpy as np
 import scipy
@@ -17,7 +17,6 @@ import scipy
 from mjfim.arrays import Array, record
 from mjfim.errors import SimulationDivergedError
 from mjfim.excitation.evaluation import UNSTABLE_GROWTH
-from mjfim.excitation.limits.constraints import ConstraintSet, constraint_set_of
 from mjfim.excitation.objective import DIVERGED, DesignPoint
 from mjfim.excitation.release_space import ReleaseSpace
 from mjfim.excitation.search.climb import Candidate, row_of
@@ -108,11 +107,6 @@ class Releases:
     space: ReleaseSpace
     plant: Plant
 
-    @cached_property
-    def _constraints(self) -> ConstraintSet:
-        """The limits."""
-        return constraint_set_of(self.stage.task)
-
     def released(self, shares: Array) -> Plant:
         """Give the plant the initial state of a release: (d,) shares."""
         return self.plant.with_initial_state(self.space.state(shares))
@@ -120,7 +114,7 @@ class Releases:
     def evaluate(self, shares: Array) -> Release:
         """Simulate a release, (d,) shares, with its limits, its information and its cost."""
         plant, task, problem = self.released(shares), self.stage.task, self.stage.problem
-        values = self._constraints.along(plant, task.theta, task.control)
+        values = self.stage.constraints.along(plant, task.theta, task.control)
         nothing = Release(shares=shares, margins={})
         if values is None:
             return nothing
@@ -136,7 +130,7 @@ class Releases:
             if problem.information.criterion == "D":
                 objective = point.cost / problem.size(point)
         margins = {
-            **self._constraints.relative_margins(values),
+            **self.stage.constraints.relative_margins(values),
             GROWTH: self._margin_of_growth(plant, values.trajectory),
         }
         return Release(shares=shares, point=point, margins=margins, objective=objective)
@@ -221,15 +215,9 @@ def _made(
     return Releases(stage=DescentLevel(task, basis), space=space, plant=plant)
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Order:
-    """Order to evaluate some releases, or to follow one."""
-
-    name: str
-    budget: Budget
-    grid: tuple[Array, ...] = ()
-    start: Release | None = None
-
+# Name of an order, releases of the grid, (d,) shares each, to be evaluated, or a release to be
+# followed, and the budget at whose end it ends.
+_Order = tuple[str, list[Array] | Release, Budget]
 
 # Name of an order, what it has tried, how it has ended, and the engine steps. Without a status its
 # time was over.
@@ -239,19 +227,21 @@ _Tried = tuple[str, list[Release], Status | None, int]
 def _tried(releases: Releases, order: _Order, stop: StopToken) -> _Tried:
     """Carry out an order."""
     before = releases.plant.engine_steps
+    name, chosen, budget = order
 
     def is_over() -> bool:
         """Whether the time is over, or a stop was requested."""
-        return stop.requested or order.budget.exhausted is not None
+        return stop.requested or budget.exhausted is not None
 
     found, status = list[Release](), None
-    if order.start is not None:
-        found, status = releases.followed(order.start, is_over)
-    for shares in order.grid:
-        if found and is_over():
-            break
-        found.append(releases.evaluate(shares))
-    return order.name, found, status, releases.plant.engine_steps - before
+    if isinstance(chosen, Release):
+        found, status = releases.followed(chosen, is_over)
+    else:
+        for shares in chosen:
+            if found and is_over():
+                break
+            found.append(releases.evaluate(shares))
+    return name, found, status, releases.plant.engine_steps - before
 
 
 class ReleaseSearch:
@@ -291,8 +281,8 @@ class ReleaseSearch:
         grid, tried = self._grid(), list[Release]()
         size = 1 if self._workers is None else RELEASES_PER_ORDER
         budget = self._budget.share(GRID_TIME_SHARE)
-        orders = [
-            _Order(name=self._found_by, budget=budget, grid=tuple(grid[first : first + size]))
+        orders: list[_Order] = [
+            (self._found_by, grid[first : first + size], budget)
             for first in range(0, len(grid), size)
         ]
         for _, found, _, _ in self._carried_out(orders, budget):
@@ -371,9 +361,7 @@ class ReleaseSearch:
         starts = {f"grid release {i} of {len(chosen)}": each for i, each in enumerate(chosen, 1)}
         if self._budget.exhausted is not None:
             return {}
-        orders = [
-            _Order(name=name, budget=self._budget, start=start) for name, start in starts.items()
-        ]
+        orders: list[_Order] = [(name, start, self._budget) for name, start in starts.items()]
         rows = {}
         for name, found, status, _ in self._carried_out(orders, self._budget):
             if not found and status is None:

@@ -10,7 +10,7 @@ from mjfim.arrays import Array, record
 from mjfim.errors import ExperimentError
 from mjfim.excitation.limits.limits import Limit
 from mjfim.experiment.system import System
-from mjfim.model.coordinates import TangentComponent, unknown_coordinate
+from mjfim.model.coordinates import Component, unknown_coordinate
 from mjfim.plant.state_space import StateSpace
 
 # Distance from an end of a range, relative to its width, up to which a release is at that end.
@@ -119,7 +119,7 @@ class ReleaseSpace:
         return found
 
 
-def _limit_of(system: System, limits: Sequence[Limit], component: TangentComponent) -> Limit | None:
+def _limit_of(system: System, limits: Sequence[Limit], component: Component) -> Limit | None:
     """The enforced limit on a position or velocity of a slide or hinge joint, if there is one."""
     if not system.experiment.limits.enforce:
         return None

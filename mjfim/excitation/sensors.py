@@ -88,8 +88,8 @@ def sensors_along(
     """
     outputs, noise, model = task.system.outputs, task.system.noise, task.system.model
     coordinates = task.system.source.coordinates
-    sensor_of = {each.name: (each.name, *each.groups)[-1] for each in coordinates.state}
-    sensor_of |= {each.name: each.sensor for each in coordinates.sensors}
+    measurable = (*coordinates.state, *coordinates.sensors)
+    sensor_of = {each.name: (each.name, *each.groups)[-1] for each in measurable}
     names = np.array([sensor_of[name] for name in outputs.names])
     rows, coarse_rows = noise.whiten(fine.G), noise.whiten(coarse.G)
     is_measured = noise.measured(len(rows) - 1) > 0.0
@@ -232,6 +232,19 @@ class Sensing:
         masks = {f"all {kind}": 1.0 * (kinds == kind) for kind in each}
         return masks if len(masks) > 1 else {}
 
+    def _worth_of(self, name: str, mask: Array) -> SensorWorth:
+        """What sensors with a mask, (s,), are worth."""
+        present, noises = self.present, {each.name: each.noise for each in self.sensors}
+        return SensorWorth(
+            name=name,
+            noise=noises.get(name, ""),
+            is_added=not (mask * present).any(),
+            without=self.std(present * (1.0 - mask)),
+            present=self.std(np.maximum(present, mask)),
+            alone=self.std(mask),
+            halved=self.std(np.maximum(present, 4.0 * mask)),
+        )
+
     def worth(self, source: str, horizon: float) -> Worth:
         """Judge what would help to determine the parameters along the motion.
 
@@ -241,7 +254,6 @@ class Sensing:
         """
         p, present, target = self.task.parameters, self.present, self.target
         several = {name: mask for name, mask in self._kinds.items() if mask.sum() > 1.0}
-        noises = {each.name: each.noise for each in self.sensors}
         return Worth(
             source=source,
             horizon=horizon,
@@ -253,16 +265,7 @@ class Sensing:
             repeated=self.std(present, 2),
             faster=self.std(2.0 * present),
             sensors=tuple(
-                SensorWorth(
-                    name=name,
-                    noise=noises.get(name, ""),
-                    is_added=not (mask * present).any(),
-                    without=self.std(present * (1.0 - mask)),
-                    present=self.std(np.maximum(present, mask)),
-                    alone=self.std(mask),
-                    halved=self.std(np.maximum(present, 4.0 * mask)),
-                )
-                for name, mask in {**self._singles, **several}.items()
+                self._worth_of(name, mask) for name, mask in {**self._singles, **several}.items()
             ),
             fewest=self.fewest(target),
         )

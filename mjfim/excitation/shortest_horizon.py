@@ -163,6 +163,15 @@ def _step_factor(ratio: float, evaluations: int) -> float:
     return float(np.clip(ratio**2, least, MAX_FACTOR))
 
 
+def _secant_or_middle(known: dict[int, float], low: int, high: int) -> float:
+    """Where the secant of the logarithms of the ratios reaches 1, or the middle of a bracket."""
+    has_secant = np.isfinite(known[low]) and known[high] < known[low]
+    if has_secant and len(known) % MIDDLE_PERIOD:
+        share = np.log(known[low]) / np.log(known[low] / known[high])
+        return float(low * (high / low) ** share)
+    return float(np.sqrt(low * high))
+
+
 def _next_inside(
     known: dict[int, float], low: int, high: int, width: int, grid: SampleGrid
 ) -> int | None:
@@ -170,12 +179,7 @@ def _next_inside(
 
     None where no number of the grid is inside.
     """
-    x = float(np.sqrt(low * high))
-    has_secant = np.isfinite(known[low]) and known[high] < known[low]
-    if has_secant and len(known) % MIDDLE_PERIOD:
-        share = np.log(known[low]) / np.log(known[low] / known[high])
-        x = float(low * (high / low) ** share)
-
+    x = _secant_or_middle(known, low, high)
     # A candidate near an end closes the bracket if the ratio is 1 between this end and it.
     if high - low > 2 * width:
         x = float(np.clip(x, low + END_DISTANCE * width, high - END_DISTANCE * width))
@@ -449,6 +453,12 @@ class _HorizonSearch:
         unit = SAMPLE_FACTORS[1]
         return SampleGrid(unit=unit, first_multiple=MIN_COARSE_SAMPLES * unit)
 
+    def _closest(self) -> int:
+        """Samples of the design that is closest to the targets, the result after a stop."""
+        if not self.designs:
+            raise NoResultError("the search was stopped before it had found a design")
+        return min(self.designs, key=lambda samples: self.tried[samples].ratio)
+
     def run(self, longest: float) -> ShortestExperiment:
         """Search the horizons up to the longest one [s]."""
         rate = self.base.experiment.rate
@@ -459,16 +469,18 @@ class _HorizonSearch:
             )
 
         largest = self.grid.round_down(longest * rate)
-        first = min(self.grid.round_up(self.base.samples), largest)
-        found, below = smallest_feasible(self.ratio, first, largest, self.grid, self.tolerance_at)
+        found, below = smallest_feasible(
+            self.ratio,
+            min(self.grid.round_up(self.base.samples), largest),
+            largest,
+            self.grid,
+            self.tolerance_at,
+        )
         has_reached = found is not None
         if found is None:
-            # After a stop, the result is the design that is closest to the targets.
             if not self.stop.requested:
                 raise self._out_of_reach(largest)
-            if not self.designs:
-                raise NoResultError("the search was stopped before it had found a design")
-            found = min(self.designs, key=lambda samples: self.tried[samples].ratio)
+            found = self._closest()
 
         # The bracket is closed where its lower end was tried, or where no shorter design exists.
         is_shortest = has_reached and found <= self.grid.minimum

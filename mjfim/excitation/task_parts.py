@@ -585,6 +585,18 @@ def holding_control(system: System, state: Array, guess: Array, *, key: str, pla
     return control
 
 
+def _without_clamps(model: Any) -> Any:
+    """A copy of a model (MjModel) without clamps of controls and forces."""
+    model = copy.copy(model)
+    clamps = Relaxation(
+        joint_forces=tuple(range(model.njnt)),
+        actuators=tuple(range(model.nactuator)),
+        controls=True,
+    )
+    clamps.apply(model)
+    return model
+
+
 def least_drift_control(system: System, state: Array, guess: Array) -> Array:
     """Find the control under which a state changes least over one sample.
 
@@ -600,13 +612,7 @@ def least_drift_control(system: System, state: Array, guess: Array) -> Array:
     Returns:
         (nu,) control, which may violate limits.
     """
-    model = copy.copy(system.plant.model(system.theta))
-    clamps = Relaxation(
-        joint_forces=tuple(range(model.njnt)),
-        actuators=tuple(range(model.nactuator)),
-        controls=True,
-    )
-    clamps.apply(model)
+    model = _without_clamps(system.plant.model(system.theta))
     sample, natural = system.plant.simulator, system.plant.sizes
     control = np.array(guess)
 

@@ -17,8 +17,6 @@ from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system_tables import Correlated, NoiseSpec
 from mjfim.model.coordinates import (
     ModelCoordinates,
-    SensorComponent,
-    StateComponent,
     unknown_coordinate,
 )
 from mjfim.plant.outputs import Noise, Output, Outputs
@@ -62,7 +60,7 @@ def resolve_outputs(
                 f"noise: {unknown_coordinate('sensor', key, list(columns_of_key))}"
             )
 
-    components: list[StateComponent | SensorComponent] = [*coordinates.state, *coordinates.sensors]
+    components = [*coordinates.state, *coordinates.sensors]
     columns = [component.name for component in components]
     covariance = np.zeros((len(columns), len(columns)))
     strides = np.full(len(columns), stride)
@@ -77,7 +75,7 @@ def resolve_outputs(
             )
         covariance[rows] = 0.0
         covariance[:, rows] = 0.0
-        factors = [getattr(components[i], "sigma_factor", 1.0) for i in rows]
+        factors = [components[i].sigma_factor for i in rows]
         covariance[np.ix_(rows, rows)] = _key_covariance(
             f"noise.{key}", stated[key], np.array(factors)
         )
@@ -98,7 +96,7 @@ def resolve_outputs(
         Output(
             name=columns[i],
             sigma=float(np.sqrt(covariance[i, i])),
-            unit=getattr(components[i], "unit", ""),
+            unit=components[i].unit,
             **{"state" if i < len(coordinates.state) else "sensor": components[i].address},
         )
         for i in kept
@@ -141,7 +139,7 @@ def columns_of_keys(coordinates: ModelCoordinates) -> dict[str, list[str]]:
     # Where a sensor has the name of a key of the state, the key means the state.
     columns_of_sensor: dict[str, list[str]] = {}
     for number in coordinates.sensors:
-        columns_of_sensor.setdefault(number.sensor, []).append(number.name)
+        columns_of_sensor.setdefault(number.groups[0], []).append(number.name)
     return found | {k: columns for k, columns in columns_of_sensor.items() if k not in found}
 
 
@@ -151,7 +149,7 @@ def _noise_of_mjcf(coordinates: ModelCoordinates, *, required: bool) -> dict[str
     They are used if the experiment states no noise. Raises ExperimentError if `required` and the
     MJCF states none either.
     """
-    stated = {each.sensor: each.sigma for each in coordinates.sensors if each.sigma > 0}
+    stated = {each.groups[0]: each.sigma for each in coordinates.sensors if each.sigma > 0}
     if required and not stated:
         valid = listed(["state", *coordinates.measurable])
         raise ExperimentError(

@@ -217,7 +217,7 @@ class _Units:
         # The noise of an orientation is an angle, although its quaternion has no unit.
         units = {c.name: c.unit if c.sigma_factor == 1.0 else ANGLE for c in coordinates.state}
         for component in coordinates.sensors:
-            sensor = identifier(model, "sensor", component.sensor)
+            sensor = identifier(model, "sensor", component.groups[0])
             units[component.name] = sensor_unit(model, sensor)
         return units
 

@@ -557,8 +557,7 @@ def _of_batch(
     def sensitivity(rows: SegmentRows) -> Array:
         """(k, n+p) derivatives by the initial state where that is free, then by theta."""
         common, private = rows.jacobians
-        both = [private, common] if problem.free_starts else [common]
-        G = np.concatenate(both, axis=2)
+        G = np.concatenate([private, common] if problem.free_starts else [common], axis=2)
         return problem.noise.whiten_present(G, problem.mask_of(rows))
 
     condensed: dict[int, Array] = {}

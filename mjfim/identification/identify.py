@@ -10,6 +10,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from pathlib import PurePath
 
 import numpy as np
 
@@ -27,7 +28,7 @@ from mjfim.identification.fit_problem import FitProblem, have_same_initial_state
 from mjfim.identification.fit_workers import FitWorkers
 from mjfim.identification.inverse_dynamics import refuse_gross_error
 from mjfim.identification.inverse_dynamics.gross_errors import STATE, column_line
-from mjfim.identification.linear_coordinates import CadPrior
+from mjfim.identification.linear_coordinates import cad_bodies, columns_of
 from mjfim.identification.search import (
     MISSED_ROUGH_SHARE,
     FitSearch,
@@ -305,18 +306,19 @@ def _refuse_other_reading(search: FitSearch, fit: FitResult) -> None:
         WrongLogError: The fit explains the recordings. The message has the lines that cure them.
     """
     task = fit.task
-    system, begins = task.system, task.elsewhere
+    system, begins = task.system, [by for _, by in task.elsewhere]
     first = fit.problem.recordings[0]
     places = measured_states(system, first)
     columns = {system.outputs.names[j]: j for x, j in places.items() if x < system.space.nq}
-    names = sorted({name for begin in begins for name in begin.by})
+    names = sorted({name for by in begins for name in by})
     paths = {target.path for each in system.parameters.parameters for target in each.targets}
     if paths & {f"output/{name}:bias" for name in names}:
         return
-    if not {*names} <= {*columns} or len(begins) < len(task.recordings) + len(task.held_out):
+    recordings = (*task.recordings, *task.held_out)
+    if not {*names} <= {*columns} or len(begins) < len(recordings):
         return
 
-    zeros = np.array([np.mean([each.by.get(name, 0.0) for each in begins]) for name in names])
+    zeros = np.array([np.mean([by.get(name, 0.0) for by in begins]) for name in names])
     stated_begin = first.y[0, [columns[name] for name in names]] - zeros
     guesses = {"bias": zeros}
     if (np.abs(zeros) < MAX_SHARE * np.abs(stated_begin)).all():
@@ -351,8 +353,9 @@ def _refuse_other_reading(search: FitSearch, fit: FitResult) -> None:
         lines.append(column_line(name, stated.get(name, ColumnSpec(column=name)), **change))
     word = "zero" if kind == "bias" else kind
     raise WrongLogError(
-        f"{listed([each.name for each in begins])}: another {word} of {listed(names)}; "
-        f"without this error the model explains the motion. {STATE}{'; '.join(lines)}"
+        f"{listed([PurePath(each.name).name for each in recordings])}: another {word} of "
+        f"{listed(names)}; without this error the model explains the motion. "
+        f"{STATE}{'; '.join(lines)}"
     )
 
 
@@ -609,7 +612,7 @@ def _unseen_directions(task: FitTask, problem: FitProblem, theta: Array) -> Null
     """Directions at theta about which the data contain no information."""
     parameters = task.system.parameters
     tested = ~np.isin(parameters.names, task.settings.hold)
-    tested[CadPrior.of(parameters).columns] = False
+    tested[columns_of(cad_bodies(parameters))] = False
     free = np.flatnonzero(tested)
     count = len(free)
     if not count:

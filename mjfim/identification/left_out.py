@@ -165,6 +165,20 @@ def affordable_part(problem: FitProblem, solution: Solution) -> tuple[FitProblem
     return problem.of_segments(subset), part
 
 
+def _other_values(problem: FitProblem, masks: Sequence[np.ndarray]) -> list[np.ndarray]:
+    """Masks of the values that are not in some masks: (M, ny) for every recording.
+
+    A segment that has no others keeps its values.
+    """
+    known = [np.zeros_like(mask) for mask in masks]
+    for segment in problem.segments:
+        i, rows = segment.recording, segment.rows
+        counted = problem.masks[i][rows]
+        others = counted & ~masks[i][rows]
+        known[i][rows] = others if others.any() else counted
+    return known
+
+
 def with_initial_states(
     problem: FitProblem, theta: Array, masks: Sequence[np.ndarray], budget: Budget
 ) -> tuple[FitProblem, UnknownValues]:
@@ -178,18 +192,9 @@ def with_initial_states(
     if problem.unknown_count <= len(problem.shared):
         return problem, at
 
-    known = [np.zeros_like(mask) for mask in masks]
-    for segment in problem.segments:
-        i, rows = segment.recording, segment.rows
-        counted = problem.masks[i][rows]
-
-        # The predicted values are used only where a segment has no others.
-        others = counted & ~masks[i][rows]
-        known[i][rows] = others if others.any() else counted
-
     # Deviations of the initial state that were fitted belong to other recordings.
     begin = replace(at, private=problem.begin(problem.parameters.guess).private)
-    held = problem.masked(known).with_shared_held()
+    held = problem.masked(_other_values(problem, masks)).with_shared_held()
     first = held.of_first_parts(1.0, INITIAL_STATE_ROWS)
     if len(first.segments_with_values) == len(held.segments):
         held = first

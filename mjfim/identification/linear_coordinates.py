@@ -7,7 +7,7 @@ where their pseudo-inertia is positive definite.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
 
 import numpy as np
 import scipy
@@ -17,7 +17,6 @@ from mjfim.model.inertia import (
     BARYCENTRIC_DERIVATIVES,
     INERTIA_PARAMETRISATIONS,
     BodyInertia,
-    InertiaDifference,
     barycentric_of,
     inertia_difference,
     is_positive_definite,
@@ -128,14 +127,14 @@ class UnknownBody:
         """Standard deviation of the prior in a linear fit, very weak where none is stated."""
         return HOLD_LOGARITHM if self.cad_sigma is None else self.cad_sigma
 
-    def linear_difference(self, linear: Array) -> InertiaDifference:
-        """Difference of an inertia, by its (10,) barycentric coordinates, from the model's."""
+    def linear_difference(self, linear: Array) -> tuple[Array, Array]:
+        """See `inertia_difference`, from the model's inertia, by (10,) barycentric coordinates."""
         return inertia_difference(
             pseudo_inertia_of(linear), BARYCENTRIC_DERIVATIVES, self.reference
         )
 
-    def difference(self, values: Array) -> InertiaDifference:
-        """Difference of an inertia, by its (10,) parameters, from the model's.
+    def difference(self, values: Array) -> tuple[Array, Array]:
+        """See `inertia_difference`, from the model's inertia, by its (10,) parameters.
 
         Barycentric coordinates of a search need not be those of a body. Their difference is the
         linearised one, whose square is that of the metric to second order.
@@ -143,16 +142,15 @@ class UnknownBody:
         if not self.is_logcholesky:
             factor = logcholesky_factor(self.reference)
             model = barycentric_of(factor @ factor.T)
-            jacobian = self.linear_difference(model).jacobian
-            return InertiaDifference(residual=jacobian @ (values - model), jacobian=jacobian)
+            _, jacobian = self.linear_difference(model)
+            return jacobian @ (values - model), jacobian
 
         with np.errstate(over="ignore", invalid="ignore"):
             factor = logcholesky_factor(values)
             pseudo_inertia = factor @ factor.T
             derivatives = logcholesky_derivatives(values)
         if not np.isfinite(derivatives).all() or not np.isfinite(pseudo_inertia).all():
-            shape = (COUNT, COUNT)
-            return InertiaDifference(residual=np.full(COUNT, np.inf), jacobian=np.zeros(shape))
+            return np.full(COUNT, np.inf), np.zeros((COUNT, COUNT))
         return inertia_difference(pseudo_inertia, derivatives, self.reference)
 
 
@@ -286,65 +284,43 @@ class LinearCoordinates:
         return slopes
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class CadPrior:
-    """Priors on the inertias of some bodies.
+# ---- priors on the inertias of some bodies
 
-    Attributes:
-        bodies: The bodies, each with the standard deviation of its prior.
-        count: Number p of parameters.
+
+def cad_bodies(parameters: ParameterSet) -> tuple[UnknownBody, ...]:
+    """Bodies whose inertias have a prior from the model, each with its standard deviation."""
+    return tuple(body for body in unknown_bodies(parameters) if body.cad_sigma is not None)
+
+
+def columns_of(bodies: Sequence[UnknownBody]) -> np.ndarray:
+    """Indices in theta of all coordinates of some bodies, ascending."""
+    return np.sort(np.array([body.columns for body in bodies], dtype=np.intp).ravel())
+
+
+def cad_rows(bodies: Sequence[UnknownBody], theta: Array, *, linear: bool = False) -> Array:
+    """Rows of the least-squares problem of the priors on the inertias of b bodies.
+
+    Args:
+        bodies: The bodies.
+        theta: (p,) parameters [theta-unit], or linear coordinates of them.
+        linear: True for linear coordinates.
+
+    Returns:
+        (10 b, p+1) rows `[J, r]`, with residuals in standard deviations; residuals are infinite
+        where an inertia is too large for the computer.
     """
+    blocks = [np.zeros((0, len(theta) + 1))]
+    for body in bodies:
+        difference = body.linear_difference if linear else body.difference
+        residual, jacobian = difference(theta[body.columns])
+        rows = np.zeros((len(residual), len(theta) + 1))
+        rows[:, body.columns] = jacobian
+        rows[:, -1] = residual
+        blocks.append(rows / body.prior_sigma)
+    return np.concatenate(blocks)
 
-    bodies: tuple[UnknownBody, ...]
-    count: int
 
-    @staticmethod
-    def of(parameters: ParameterSet) -> CadPrior:
-        """The priors of an experiment.
-
-        Args:
-            parameters: The p parameters.
-        """
-        known = [body for body in unknown_bodies(parameters) if body.cad_sigma is not None]
-        return CadPrior(bodies=tuple(known), count=len(parameters))
-
-    @property
-    def columns(self) -> np.ndarray:
-        """Indices in theta of all coordinates with such a prior, ascending."""
-        places = np.array([body.columns for body in self.bodies], dtype=np.intp)
-        return np.sort(places.ravel())
-
-    def of_bodies(self, is_wanted: np.ndarray) -> CadPrior:
-        """The priors on the bodies whose coordinates are wanted.
-
-        Args:
-            is_wanted: (p,) True for wanted parameters.
-        """
-        wanted = tuple(body for body in self.bodies if is_wanted[body.columns].all())
-        return CadPrior(bodies=wanted, count=self.count)
-
-    def rows(self, theta: Array, *, linear: bool = False) -> Array:
-        """Rows of the least-squares problem.
-
-        Args:
-            theta: (p,) parameters [theta-unit], or linear coordinates of them.
-            linear: True for linear coordinates.
-
-        Returns:
-            (10 b, p+1) rows `[J, r]` of b bodies, with residuals in standard deviations; residuals
-            are infinite where an inertia is too large for the computer.
-        """
-        blocks = [np.zeros((0, self.count + 1))]
-        for body in self.bodies:
-            difference = body.linear_difference if linear else body.difference
-            found = difference(theta[body.columns])
-            rows = np.zeros((len(found.residual), self.count + 1))
-            rows[:, body.columns] = found.jacobian
-            rows[:, -1] = found.residual
-            blocks.append(rows / body.prior_sigma)
-        return np.concatenate(blocks)
-
-    def information(self, theta: Array) -> Array:
-        """(p, p) information of the priors about the parameters at theta: (p,)."""
-        J = self.rows(theta)[:, :-1]
-        return J.T @ J
+def cad_information(bodies: Sequence[UnknownBody], theta: Array) -> Array:
+    """(p, p) information of these priors about the parameters at theta: (p,)."""
+    J = cad_rows(bodies, theta)[:, :-1]
+    return J.T @ J

@@ -136,6 +136,16 @@ class Meter:
         return self.read().std
 
     @one_blas_thread()
+    def _simulate_kept(self, ended: bool) -> None:
+        """Simulate the kept rows, and drop those that are needed no more."""
+        if self._simulation is None:
+            self._begin(ended)
+        if self._simulation is not None:
+            t, ctrl, y = map(np.array, zip(*self._kept, strict=True))
+            self._simulation.advance(t, ctrl, y, ended=ended)
+            self._note(self._simulation.time, self._simulation.std)
+            del self._kept[: max(self._simulation.first_row(t) - KEPT_ROWS, 0)]
+
     def read(self, *, ended: bool = False) -> Watch:
         """Simulate the rows that were added, and return what is known.
 
@@ -152,13 +162,7 @@ class Meter:
             raise RecordingError(
                 f"the stream has too few rows ({self._rows}), not {MIN_ROWS} or more"
             )
-        if self._simulation is None:
-            self._begin(ended)
-        if self._simulation is not None:
-            t, ctrl, y = map(np.array, zip(*self._kept, strict=True))
-            self._simulation.advance(t, ctrl, y, ended=ended)
-            self._note(self._simulation.time, self._simulation.std)
-            del self._kept[: max(self._simulation.first_row(t) - KEPT_ROWS, 0)]
+        self._simulate_kept(ended)
         asked, names = self._asked, self.system.parameters.names
         return Watch(
             parameters=tuple(names[j] for j in asked.tolist()),
@@ -183,7 +187,7 @@ class Meter:
         names = self.system.outputs.names
         first = Recording(t=t, ctrl=ctrl[:-1], y=y, outputs=names, name="stream")
         task = FitTask.of(self.system, [first])
-        self._warnings = tuple(map(str, task.elsewhere))
+        self._warnings = tuple(sentence for sentence, _ in task.elsewhere)
         self._simulation = _Simulation(task.problem())
 
     def _note(self, now: float, std: Array) -> None:
@@ -303,13 +307,15 @@ class _Simulation:
             before = int(np.searchsorted(recording.t, now * dt, side="right")) - 1
             since = np.maximum(recording.t[before:] - now * dt, 0.0)
             held = resample_control(since, recording.ctrl[before:-1], dt)
+            first = curves.samples
             response = curves.advance(held[None, : min(most, stop - now)])
             if response is None:
                 raise SimulationDivergedError(
                     f"the model at the guess diverges {self.time:.3g} s after the first row; with "
                     "segments = SECONDS in [fit], the simulation begins again at measured states"
                 )
-            for found in fit.rows_of_segment(fit.parameters.guess, 0, 0, response):
+            curve = [None if each is None else each[0] for each in response]
+            for found in fit.rows_of_segment(fit.parameters.guess, 0, first, *curve):
                 _, r, J = fit.linearised(found)
                 self._triangle = triangle(np.vstack([self._triangle, np.column_stack([J, r])]))
 

@@ -195,6 +195,15 @@ class SegmentSimulation(FitUnknowns):
             [plant.model(theta)], start, inputs[:, lead:], context=context
         )
 
+    def _differences(self, directions: int) -> tuple[bool, float]:
+        """Whether differences along some directions are two-sided, and their relative step."""
+        # Two-sided differences are more accurate; with much data they take too long.
+        central = self.central
+        if central is None:
+            central = self.sample_count * 2 * directions < SAMPLES_FOR_ONE_SIDED
+        factor = 1.0 if central else ONE_SIDED_STEP_FACTOR
+        return central, factor * self.difference_step
+
     def batches(
         self,
         *,
@@ -214,14 +223,8 @@ class SegmentSimulation(FitUnknowns):
         if wanted is None:
             wanted = self.estimated
 
-        # Two-sided differences are more accurate; with much data they take too long.
         directions = int(wanted.sum()) + self.private_count
-        central, step = self.central, self.difference_step
-        if central is None:
-            central = self.sample_count * 2 * directions < SAMPLES_FOR_ONE_SIDED
-        if not central:
-            step = ONE_SIDED_STEP_FACTOR * step
-
+        central, step = self._differences(directions)
         simulations = 1 + derivatives * directions * (1 + central)
 
         # The states of a batch have to fit into memory.
@@ -257,11 +260,26 @@ class SegmentSimulation(FitUnknowns):
         Raises:
             DivergedSegmentError: A simulation diverges.
         """
-        theta = self.theta_of_recording(at, batch.recording)
+        theta, first = self.theta_of_recording(at, batch.recording), 0
+        for response in self._responses(at, batch, theta):
+            if response is None:
+                raise DivergedSegmentError
+            for place, i in enumerate(batch.segments):
+                curve = [None if each is None else each[place] for each in response]
+                yield from self.rows_of_segment(theta, i, first, *curve)
+            first += response[0].shape[1] - 1
+
+    def _responses(
+        self, at: UnknownValues, batch: SegmentBatch, theta: Array
+    ) -> Iterator[Response | None]:
+        """Responses of a batch with the parameters theta, (p,), over one interval after the other.
+
+        None where a simulation diverges.
+        """
         longest = max(self.segments[i].samples for i in batch.segments)
         lead = self.system.plant.lead(theta)
         begins = np.array([self.segments[i].begin for i in batch.segments])
-        responses = self.system.plant.derivatives.responses(
+        return self.system.plant.derivatives.responses(
             theta,
             np.stack([self.initial_state(at, i) for i in batch.segments]),
             np.stack([self._control(i, longest, lead) for i in batch.segments]),
@@ -272,11 +290,6 @@ class SegmentSimulation(FitUnknowns):
             step=batch.step,
             wanted=batch.wanted,
         )
-        for response in responses:
-            if response is None:
-                raise DivergedSegmentError
-            for place, i in enumerate(batch.segments):
-                yield from self.rows_of_segment(theta, i, place, response)
 
     def initial_state(self, at: UnknownValues, index: int) -> Array:
         """(ns,) state at which a segment begins."""
@@ -300,16 +313,18 @@ class SegmentSimulation(FitUnknowns):
         return recorded[np.clip(places, 0, len(recorded) - 1)]
 
     def rows_of_segment(
-        self, theta: Array, index: int, place: int, response: Response
+        self, theta: Array, index: int, first: int, *simulated: Array | None
     ) -> Iterator[SegmentRows]:
         """Predictions of the rows of a segment inside a simulated interval, if there are any.
 
         Args:
             theta: (p,) parameters of the recording.
             index: Index of the segment.
-            place: Place of the segment in the batch.
-            response: Simulation of the batch over the interval.
+            first: Sample of the segment at which the interval begins.
+            *simulated: (n+1, ny) outputs over the interval and, unless they are None, their
+                derivatives by theta and by directions of the initial state; see `Response`.
         """
+        found = [each for each in simulated if each is not None]
         segment = self.segments[index]
         recording = self.recordings[segment.recording]
 
@@ -319,13 +334,13 @@ class SegmentSimulation(FitUnknowns):
         times = recording.t[segment.rows] / recording.dt - segment.begin - delay / recording.dt
 
         # Rows in this interval; the last interval includes its end.
-        samples = response.y.shape[1] - 1
+        samples = len(found[0]) - 1
         clipped = np.clip(times, 0.0, segment.samples)
-        is_last = response.first + samples >= segment.samples
-        inside = clipped >= response.first
-        inside &= (clipped < response.first + samples) | is_last
+        is_last = first + samples >= segment.samples
+        inside = clipped >= first
+        inside &= (clipped < first + samples) | is_last
         if inside.any():
-            y, *jacobians = self._at_times(response, place, recording, times[inside])
+            y, *jacobians = self._at_times(found, recording, times[inside] - first)
             yield SegmentRows(
                 segment=index,
                 recording=segment.recording,
@@ -335,31 +350,25 @@ class SegmentSimulation(FitUnknowns):
             )
 
     def _at_times(
-        self, response: Response, place: int, recording: AlignedRecording, times: Array
+        self, found: list[Array], recording: AlignedRecording, times: Array
     ) -> list[Array]:
         """(k, ny) outputs of a segment at some times, and their derivatives if there are any.
 
         Args:
-            response: Simulation of a batch over an interval.
-            place: Place of the segment in the batch.
+            found: (n+1, ny) outputs over an interval, and their derivatives if there are any.
             recording: Recording of the segment.
-            times: (k,) times of the rows [samples since the begin of the segment].
+            times: (k,) times of the rows [samples since the begin of the interval].
         """
-        found = [
-            each[place]
-            for each in (response.y, response.common, response.private)
-            if each is not None
-        ]
         delay_derivative = self.parameters.delay_derivative
         is_delayed = bool(delay_derivative.any())
 
         # Rows on the grid are samples of the simulation.
         if recording.on_grid and not is_delayed:
-            sample = np.rint(times).astype(int) - response.first
+            sample = np.rint(times).astype(int)
             return [each[sample] for each in found]
 
         # Other rows are interpolated between the samples; the derivative by the delay is added.
-        interpolation = OutputDelay.at(times - response.first, len(found[0]), recording.dt)
+        interpolation = OutputDelay.at(times, len(found[0]), recording.dt)
         at_times = [interpolation.apply(each) for each in found]
         if is_delayed and len(found) > 1:
             change = interpolation.derivative(found[0])

@@ -37,64 +37,38 @@ from mjfim.records.trajectory import Recording
 FRICTION_COLUMNS = slice(3, 6)
 
 
-@record
-class Bristle:
-    """The bristle of one passive device at a slide or hinge.
-
-    Attributes:
-        actuator: Number of the device among the actuators.
-        address: Address of its deflection among the activations.
-        dof: Degree of freedom of its joint.
-    """
-
-    actuator: int
-    address: int
-    dof: int
-
-    def speed(self, model: Any, qvel: Array) -> Array:
-        """(n,) speeds of the device.
-
-        Args:
-            model: The compiled model (`mujoco.MjModel`).
-            qvel: (n, nv) velocities [m/s or rad/s].
-        """
-        return actuator_gear(model, self.actuator) * qvel[:, self.dof]
-
-    def deflection(self, model: Any, speed: Array, direction: Array) -> Array:
-        """(n,) deflections in steady sliding.
-
-        Args:
-            model: The compiled model (`mujoco.MjModel`).
-            speed: (n,) speeds of the device.
-            direction: (n,) the signs of the speeds, or numbers between -1 and 1 near rest.
-        """
-        stiffness = model.actuator_dynprm[self.actuator, BRISTLE_STIFFNESS_COLUMN]
-        coulomb, static, stribeck = model.actuator_biasprm[self.actuator, FRICTION_COLUMNS]
-        ratio = speed / max(stribeck, mujoco.mjMINVAL)
-        force = coulomb + (static - coulomb) * np.exp(-(ratio**2))
-        return np.asarray(direction * force / stiffness)
-
-
-def bristles_of(model: Any) -> tuple[Bristle, ...]:
+def bristles_of(model: Any) -> Iterator[tuple[int, int, int]]:
     """Bristles of the passive devices of a model at slides and hinges.
 
     Args:
         model: The compiled model (`mujoco.MjModel`).
+
+    Yields:
+        Number of the device among the actuators, address of its deflection among the activations,
+        and degree of freedom of its joint.
     """
     scalar = (int(mujoco.mjtJoint.mjJNT_SLIDE), int(mujoco.mjtJoint.mjJNT_HINGE))
-    found = []
     for actuator in bristle_actuators(model):
         joint = int(model.actuator_trnid[actuator, 0])
         at_joint = int(model.actuator_trntype[actuator]) == int(mujoco.mjtTrn.mjTRN_JOINT)
         if at_joint and int(model.jnt_type[joint]) in scalar:
-            found.append(
-                Bristle(
-                    actuator=actuator,
-                    address=int(model.actuator_actadr[actuator]),
-                    dof=int(model.jnt_dofadr[joint]),
-                )
-            )
-    return tuple(found)
+            yield actuator, int(model.actuator_actadr[actuator]), int(model.jnt_dofadr[joint])
+
+
+def bristle_deflection(model: Any, actuator: int, speed: Array, direction: Array) -> Array:
+    """(n,) deflections of a bristle in steady sliding.
+
+    Args:
+        model: The compiled model (`mujoco.MjModel`).
+        actuator: Number of its device among the actuators.
+        speed: (n,) speeds of the device.
+        direction: (n,) the signs of the speeds, or numbers between -1 and 1 near rest.
+    """
+    stiffness = model.actuator_dynprm[actuator, BRISTLE_STIFFNESS_COLUMN]
+    coulomb, static, stribeck = model.actuator_biasprm[actuator, FRICTION_COLUMNS]
+    ratio = speed / max(stribeck, mujoco.mjMINVAL)
+    force = coulomb + (static - coulomb) * np.exp(-(ratio**2))
+    return np.asarray(direction * force / stiffness)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -174,9 +148,9 @@ class KnownActivations:
 
     def _bent(self, actuator: int, qvel: Array) -> Array:
         """(n,) deflections of a bristle in steady sliding at velocities qvel: (n, nv)."""
-        bristle = next(each for each in bristles_of(self.model) if each.actuator == actuator)
-        speed = bristle.speed(self.model, qvel)
-        return bristle.deflection(self.model, speed, np.sign(speed))
+        dof = next(dof for each, _, dof in bristles_of(self.model) if each == actuator)
+        speed = actuator_gear(self.model, actuator) * qvel[:, dof]
+        return bristle_deflection(self.model, actuator, speed, np.sign(speed))
 
 
 # Number of measured rows before and after a time to which a polynomial is fitted, to find the state
@@ -264,25 +238,9 @@ def has_free_starts(system: System) -> bool:
     return is_measured or (bool(system.experiment.initial.free) and not moves)
 
 
-@record
-class OtherBegin:
-    """A recording whose first rows contradict the stated initial state.
-
-    Attributes:
-        name: Name of its file.
-        by: By output, what the first rows show beyond the stated state [unit of the output].
-        words: These numbers in words.
-    """
-
-    name: str
-    by: dict[str, float]
-    words: str
-
-    def __str__(self) -> str:
-        return (
-            f"{self.name} does not begin where [initial] says ({self.words}): its initial state "
-            "was estimated from its first rows"
-        )
+# A sentence about a recording whose first rows contradict the stated initial state, and by output
+# what they show beyond this state [unit of the output].
+OtherBegin = tuple[str, dict[str, float]]
 
 
 def begins_elsewhere(system: System, recordings: Sequence[Recording]) -> tuple[OtherBegin, ...]:
@@ -334,8 +292,11 @@ def begins_elsewhere(system: System, recordings: Sequence[Recording]) -> tuple[O
         ]
         if other:
             by = {outputs[j].name: float(difference[j]) for j in other}
-            name = Path(recording.name).name
-            found.append(OtherBegin(name=name, by=by, words=listed(words)))
+            sentence = (
+                f"{Path(recording.name).name} does not begin where [initial] says "
+                f"({listed(words)}): its initial state was estimated from its first rows"
+            )
+            found.append((sentence, by))
     return tuple(found)
 
 

@@ -16,7 +16,12 @@ import numpy as np
 from mjfim.arrays import Array, record
 from mjfim.experiment.system import System
 from mjfim.identification.aligned_recording import AlignedRecording
-from mjfim.identification.linear_coordinates import CadPrior, UnknownBody, unknown_bodies
+from mjfim.identification.linear_coordinates import (
+    UnknownBody,
+    cad_bodies,
+    cad_rows,
+    unknown_bodies,
+)
 from mjfim.identification.segments import Segment
 from mjfim.information.null_space import NullSpace
 from mjfim.model.parameters import ParameterSet
@@ -143,6 +148,17 @@ class FitUnknowns:
                     columns += [column] * (not np.isin(j, whole))
         return np.unique(np.array(columns, dtype=np.intp))
 
+    def _last_possible(self, theta: Array, j: int, inside: float) -> float:
+        """Last value of parameter j that is possible, between one inside and that of theta."""
+        theta, end = np.array(theta), theta[j]
+        for _ in range(HALVINGS_TO_BOUND):
+            theta[j] = middle = 0.5 * (inside + end)
+            if self.system.impossible(theta):
+                end = middle
+            else:
+                inside = middle
+        return inside
+
     def bounds_at(self, at: UnknownValues) -> tuple[Array, Array]:
         """Bounds of each common unknown where the others stay: the stated ones and physical ones.
 
@@ -162,15 +178,8 @@ class FitUnknowns:
                 if not np.isfinite(end):
                     end = inside + sign * LARGEST_MOVE * self.parameters.magnitude[j]
                 theta[j] = end
-                if not self.system.impossible(theta):
-                    continue
-                for _ in range(HALVINGS_TO_BOUND):
-                    theta[j] = middle = 0.5 * (inside + end)
-                    if self.system.impossible(theta):
-                        end = middle
-                    else:
-                        inside = middle
-                bounds[side, column] = inside
+                if self.system.impossible(theta):
+                    bounds[side, column] = self._last_possible(theta, j, inside)
         return bounds[0], bounds[1]
 
     @property
@@ -343,17 +352,17 @@ class FitUnknowns:
         # An inertia with a value for each recording has a prior in each of them.
         is_own = np.isin(np.arange(len(parameters)), self.per_recording)
         for is_wanted, count in ((~is_own, 1), (is_own, len(self.recordings))):
-            prior = self._cad.of_bodies(is_wanted)
-            for recording in range(count if prior.bodies else 0):
-                found = prior.rows(self.theta_of_recording(at, recording))
+            bodies = [body for body in self._cad_bodies if is_wanted[body.columns].all()]
+            for recording in range(count if bodies else 0):
+                found = cad_rows(bodies, self.theta_of_recording(at, recording))
                 columns = self.to_columns(found[:, :-1], recording)
                 rows.append(np.column_stack([columns, found[:, -1]]))
         return np.concatenate(rows)
 
     @cached_property
-    def _cad(self) -> CadPrior:
-        """Priors from the model's inertias."""
-        return CadPrior.of(self.parameters)
+    def _cad_bodies(self) -> tuple[UnknownBody, ...]:
+        """Bodies with a prior from the model's inertias."""
+        return cad_bodies(self.parameters)
 
     @property
     def _pins_involve_private(self) -> bool:

@@ -139,6 +139,18 @@ class GeomPair:
     bodies: str
 
 
+def _require_pairs(ignored: Collection[frozenset[str]], bodies: Sequence[str]) -> None:
+    """Require that names that are to be ignored are pairs of bodies; ExperimentError."""
+    for names in ignored:
+        for name in sorted(names):
+            if name not in bodies:
+                raise ExperimentError(f"ignored: {unknown('body', name, bodies)}")
+        if len(names) != 2:
+            raise ExperimentError(
+                f"ignored: {sorted(names)} is no pair of bodies; needs two different names"
+            )
+
+
 def find_geom_pairs(model: Any, ignored: Collection[frozenset[str]]) -> tuple[GeomPair, ...]:
     """All pairs of geoms that move relative to each other and that may collide.
 
@@ -156,15 +168,7 @@ def find_geom_pairs(model: Any, ignored: Collection[frozenset[str]]) -> tuple[Ge
     """
     bodies = unique_names(model, "body")
     labels = geom_labels(model)
-    for names in ignored:
-        for name in sorted(names):
-            if name not in bodies:
-                raise ExperimentError(f"ignored: {unknown('body', name, bodies)}")
-        if len(names) != 2:
-            raise ExperimentError(
-                f"ignored: {sorted(names)} is no pair of bodies; needs two different names"
-            )
-
+    _require_pairs(ignored, bodies)
     body_of = [bodies[body] for body in model.geom_bodyid.tolist()]
     found = []
     for first, second in _pairs_that_may_collide(model):
@@ -385,8 +389,8 @@ class GeomDistances:
 
         # Measure in ascending order of the bounds. Stop at the first bound that exceeds the
         # smallest distance found: no later pair can be nearer.
-        ascending = np.unravel_index(np.argsort(bounds, axis=None), bounds.shape)
-        for k, p in zip(*ascending, strict=True):
+        for place in np.argsort(bounds, axis=None).tolist():
+            k, p = divmod(place, len(self.pairs))
             distance = float(bounds[k, p])
             if distance >= best:
                 break
@@ -394,7 +398,7 @@ class GeomDistances:
                 self._set_pose(positions[k], frames[k])
                 distance = self._distance(p, min(best, self._infinite), None)
             if distance < best:
-                best, row, pair = distance, int(k), self.pairs[p]
+                best, row, pair = distance, k, self.pairs[p]
         return best, row, pair
 
     def _block(self, qpos: Array, slopes: bool) -> SignedDistances:

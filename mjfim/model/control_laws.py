@@ -63,22 +63,6 @@ CONTINUOUS: tuple[Quantity, ...] = ("reference", "reference_velocity", "feedforw
 
 
 @record
-class LawField(ModelField):
-    """One number of a control law, inside the custom numbers of the model.
-
-    Attributes:
-        size: Size with which a change is compared where the value is zero; 0 where only the value
-            shows it.
-    """
-
-    size: float = 0.0
-
-    def magnitude(self, model: Any) -> float:
-        """The stated size."""
-        return self.size
-
-
-@record
 class InputColumn:
     """One column of a log that drives a simulation.
 
@@ -250,7 +234,12 @@ def first_number(model: Any, actuator: str) -> int:
     return int(model.numeric_adr[numeric.id]) + len(DESCRIPTION)
 
 
-def law_field(model: Any, actuator: str, field: str, component: int) -> LawField:
+def is_law_number(field: object) -> bool:
+    """Whether the field of a target is a number of a control law, a custom number of the model."""
+    return isinstance(field, ModelField) and field.array == "numeric_data"
+
+
+def law_field(model: Any, actuator: str, field: str, component: int) -> ModelField:
     """The field of a number of a law.
 
     Args:
@@ -278,7 +267,7 @@ def law_field(model: Any, actuator: str, field: str, component: int) -> LawField
         first = place - NUMBERS.index("integral") + NUMBERS.index("saturation_low")
         ends = np.abs(model.numeric_data[first : first + 2])
         size = float(ends[np.isfinite(ends)].max(initial=0.0))
-    return LawField(array="numeric_data", rows=(place,), size=size)
+    return ModelField(array="numeric_data", rows=(place,), size=size)
 
 
 def law_unit(model: Any, actuator: str, field: str) -> str:

@@ -90,63 +90,35 @@ class ScalarJoint:
 
 
 @record
-class StateComponent:
-    """One number of qpos or qvel, which can be measured and recorded.
+class Component:
+    """One number of a state, of a deviation of it, or of a sensor with a name.
 
     Attributes:
-        name: Column of the number, `qpos:<joint>`, `qvel:<joint>`, or these with a part.
+        name: Column of the number: `qpos:<joint>`, `qvel:<joint>`, these with a part, `act:<name>`,
+            or the name of a sensor, with `[i]` where it has several numbers.
+        address: Its place in the state vector (qpos, qvel, act), in the tangent space (dq, dv, da),
+            or in the sensor data.
+        unit: Its unit; empty for components of quaternions, activations and sensors.
         groups: Names of the groups of columns that it belongs to, for example `qpos:base.rot` and
-            `qpos:base`.
-        address: Its place in the state vector (qpos, qvel, act).
-        unit: Its unit; empty for components of quaternions.
+            `qpos:base`, or the sensor.
+        path: Parameter path of a deviation of the initial state, `initial/<joint>:qpos`; empty
+            where the joint or actuator has no name in the MJCF.
         sigma_factor: Its standard deviation over the stated one of a group; 1/2 for components of
             quaternions.
+        sigma: Standard deviation of the noise of a sensor that the MJCF states, 0 where it states
+            none [unit of the sensor].
         is_added: Whether it belongs to a joint that a physical term has added, which is measured
             only where it is named.
     """
 
     name: str
+    address: int
+    unit: str = ""
     groups: tuple[str, ...] = ()
-    address: int
-    unit: str
+    path: str = ""
     sigma_factor: float = 1.0
+    sigma: float = 0.0
     is_added: bool = False
-
-
-@record
-class TangentComponent:
-    """One number of a deviation of the state, in the tangent space (dq, dv, da).
-
-    Attributes:
-        name: `qpos:<joint>`, `qvel:<joint>`, these with a part, or `act:<actuator>`.
-        path: Parameter path of the deviation of the initial state, `initial/<joint>:qpos`; empty
-            where the joint or actuator has no name in the MJCF.
-        address: Its place in the tangent space.
-        unit: Its unit; empty for activations.
-    """
-
-    name: str
-    path: str
-    address: int
-    unit: str
-
-
-@record
-class SensorComponent:
-    """One number of a sensor with a name, which can be measured and recorded.
-
-    Attributes:
-        name: Column of the number: the name of the sensor, with `[i]` where it has several numbers.
-        sensor: Name of the sensor.
-        address: Its place in the sensor data.
-        sigma: Standard deviation of its noise that the MJCF states, 0 where it states none [unit of
-            the sensor].
-    """
-
-    name: str
-    sensor: str
-    address: int
-    sigma: float
 
 
 @record
@@ -165,9 +137,9 @@ class ModelCoordinates:
     controls: tuple[str, ...]
     scalar_joints: tuple[ScalarJoint, ...]
     unnamed_joints: int
-    state: tuple[StateComponent, ...]
-    sensors: tuple[SensorComponent, ...]
-    deviations: tuple[TangentComponent, ...]
+    state: tuple[Component, ...]
+    sensors: tuple[Component, ...]
+    deviations: tuple[Component, ...]
 
     @classmethod
     def of(cls, model: Any, added: Collection[int] = ()) -> ModelCoordinates:
@@ -282,10 +254,10 @@ def _joint_numbers(
                 yield field, j, name, part, unit if field == "qpos" else per_second(unit)
 
 
-def state_components(model: Any) -> tuple[StateComponent, ...]:
+def state_components(model: Any) -> tuple[Component, ...]:
     """The nq + nv numbers of the state without activations: all of qpos, then all of qvel."""
     return tuple(
-        StateComponent(
+        Component(
             name=f"{field}:{name}.{part}" if part else f"{field}:{name}",
             groups=(
                 (f"{field}:{name}.{'pos' if part in TRANSLATION else 'rot'}", f"{field}:{name}")
@@ -302,14 +274,14 @@ def state_components(model: Any) -> tuple[StateComponent, ...]:
     )
 
 
-def tangent_components(model: Any) -> tuple[TangentComponent, ...]:
+def tangent_components(model: Any) -> tuple[Component, ...]:
     """The nx = 2 nv + na numbers of a deviation of the state, in the order (dq, dv, da)."""
     found = []
     numbers = _joint_numbers(model, with_quaternions=False)
     for address, (field, j, name, part, unit) in enumerate(numbers):
         suffix = f".{part}" if part else ""
         is_named = element_name(model, "joint", j) != ""
-        component = TangentComponent(
+        component = Component(
             name=f"{field}:{name}{suffix}",
             path=f"initial/{name}:{field}{suffix}" if is_named else "",
             address=address,
@@ -319,9 +291,9 @@ def tangent_components(model: Any) -> tuple[TangentComponent, ...]:
     return (*found, *_activation_components(model))
 
 
-def _activation_components(model: Any) -> tuple[TangentComponent, ...]:
+def _activation_components(model: Any) -> tuple[Component, ...]:
     """The na activations by their address: `act:<actuator>`, with `[i]` if there are several."""
-    found: list[TangentComponent] = []
+    found: list[Component] = []
     for i, name in enumerate(actuator_names(model)):
         first = 2 * model.nv + int(model.actuator_actadr[i])
         count = model.actuator_actnum[i]
@@ -329,7 +301,7 @@ def _activation_components(model: Any) -> tuple[TangentComponent, ...]:
         columns = _indexed(f"act:{name}", count)
         paths = _indexed(f"initial/{name}:act", count)
         found += [
-            TangentComponent(name=column, path=path if named else "", address=first + k, unit="")
+            Component(name=column, path=path if named else "", address=first + k)
             for k, (column, path) in enumerate(zip(columns, paths, strict=True))
         ]
     return tuple(sorted(found, key=lambda component: component.address))
@@ -377,14 +349,14 @@ def sensor_columns(model: Any, sensor: str) -> list[str]:
     return _indexed(sensor, width)
 
 
-def sensor_components(model: Any) -> tuple[SensorComponent, ...]:
+def sensor_components(model: Any) -> tuple[Component, ...]:
     """The numbers of all sensors that have a name, in the order of the model."""
-    found: list[SensorComponent] = []
+    found: list[Component] = []
     for name in names_of(model, "sensor"):
         sensor = model.sensor(name)
         first, sigma = int(sensor.adr[0]), float(sensor.noise[0])
         found += [
-            SensorComponent(name=column, sensor=name, address=first + i, sigma=sigma)
+            Component(name=column, groups=(name,), address=first + i, sigma=sigma)
             for i, column in enumerate(sensor_columns(model, name))
         ]
     return tuple(found)

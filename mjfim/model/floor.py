@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from mjfim.arrays import Array, record
+from mjfim.arrays import Array
 from mjfim.model.clearance import PLANE, PRIMITIVES, farthest_points
 from mjfim.model.elements import model_length
 
@@ -22,21 +22,6 @@ LEVEL_FLOOR = 0.99
 
 # Places of the bodies and of the geoms, and frames of the geoms.
 Pose = tuple[Array, Array, Array]
-
-
-@record
-class Floor:
-    """The floor under a robot.
-
-    Attributes:
-        height: Its height against gravity [m]; minus infinity without a floor.
-        is_stated: Whether the model has it as a plane, or its height is stated.
-        depth: Height below it that counts as passing through it [m].
-    """
-
-    height: float
-    is_stated: bool
-    depth: float
 
 
 def pose_of(data: Any) -> Pose:
@@ -100,7 +85,7 @@ def _geom_heights(model: Any, poses: Sequence[Pose], geoms: NDArray[np.intp]) ->
     return lowest
 
 
-def find_floor(model: Any, qpos: Array, stated: float | None = None) -> Floor:
+def find_floor(model: Any, qpos: Array, stated: float | None = None) -> tuple[float, bool, float]:
     """Find the floor under a robot in its start, or the floor that it most likely has.
 
     A plane of the model below the robot is its floor. Without one, the lower end of a base that
@@ -111,6 +96,11 @@ def find_floor(model: Any, qpos: Array, stated: float | None = None) -> Floor:
         model: The model (`mujoco.MjModel`).
         qpos: (nq,) positions of the start.
         stated: Height of the floor where it is known [m].
+
+    Returns:
+        Its height against gravity [m], minus infinity without a floor; whether the model has it as
+        a plane, or its height is stated; and the height below it that counts as passing through it
+        [m].
     """
     data, up = mujoco.MjData(model), _upwards(model)
     data.qpos[:] = qpos
@@ -132,7 +122,7 @@ def find_floor(model: Any, qpos: Array, stated: float | None = None) -> Floor:
         halves = model.geom_aabb[moving[touch.any(axis=1)], 3:]
         depth = max(depth, float(halves.min())) if halves.size else depth
         height = float(below.max())
-        return Floor(height=height, is_stated=bool(np.isfinite(height)), depth=depth)
+        return height, bool(np.isfinite(height)), depth
 
     base = np.flatnonzero(_has_shape(model) & of_fixed & (model.geom_bodyid > 0))
     foot = float(_geom_heights(model, poses, base)[0])
@@ -148,4 +138,4 @@ def find_floor(model: Any, qpos: Array, stated: float | None = None) -> Floor:
         height = min(foot, lowest)
     elif is_above and (is_free or len(moving)):
         height = min(0.0, lowest)
-    return Floor(height=height, is_stated=False, depth=depth)
+    return height, False, depth

@@ -367,28 +367,19 @@ def is_positive_definite(pseudo_inertia: Array) -> bool:
 # ---- distance
 
 
-@record
-class InertiaDifference:
-    """Logarithm of a pseudo-inertia relative to another one, as the residuals of a prior.
-
-    Attributes:
-        residual: (10,) entries of the logarithm; the sum of their squares is `2 d²`.
-        jacobian: (10, n) their derivatives by n coordinates.
-    """
-
-    residual: Array
-    jacobian: Array
-
-
 def inertia_difference(
     pseudo_inertia: Array, derivatives: Array, reference: Array
-) -> InertiaDifference:
-    """Difference of a pseudo-inertia from a reference.
+) -> tuple[Array, Array]:
+    """Logarithm of a pseudo-inertia relative to another one, as the residuals of a prior.
 
     Args:
         pseudo_inertia: (4, 4) the pseudo-inertia.
         derivatives: (n, 4, 4) its derivatives by n coordinates.
         reference: (10,) log-Cholesky coordinates of the reference.
+
+    Returns:
+        (10,) entries of the logarithm, the sum of whose squares is `2 d²`, and their (10, n)
+        derivatives.
     """
     inverse = np.linalg.inv(logcholesky_factor(reference))
     relative = inverse @ pseudo_inertia @ inverse.T
@@ -401,9 +392,7 @@ def inertia_difference(
     ratio = _divided_differences(eigenvalues, logarithms)
     moves = axes.T @ inverse @ derivatives @ inverse.T @ axes
     changes = axes @ (ratio * moves) @ axes.T
-    return InertiaDifference(
-        residual=_norm_entries((axes * logarithms) @ axes.T), jacobian=_norm_entries(changes).T
-    )
+    return _norm_entries((axes * logarithms) @ axes.T), _norm_entries(changes).T
 
 
 def _divided_differences(values: Array, logarithms: Array) -> Array:

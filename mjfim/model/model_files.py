@@ -30,20 +30,6 @@ URI_SEPARATOR = "://"
 PACKAGE = "package://"
 
 
-@record
-class UrdfSource:
-    """A URDF whose links and joints are bodies and joints of a model.
-
-    Attributes:
-        path: The URDF file.
-        prefixes: What stands before the names of its links and joints in the model, one for each
-            time it is attached.
-    """
-
-    path: Path
-    prefixes: tuple[str, ...]
-
-
 def included_file(main: Path, including: Path, name: str) -> Path | None:
     """Find the file that an `<include>` names.
 
@@ -168,35 +154,37 @@ def is_urdf(path: Path) -> bool:
     return root is not None and root.tag == "robot"
 
 
-def urdf_sources(path: Path) -> tuple[UrdfSource, ...]:
-    """Find the URDFs from which a model comes.
+def urdf_sources(path: Path) -> dict[Path, tuple[str, ...]]:
+    """Find the URDFs whose links and joints are bodies and joints of a model.
 
     Args:
         path: The model file.
 
     Returns:
-        The model itself where it is a URDF; otherwise those that an MJCF attaches.
+        The model itself where it is a URDF; otherwise those that an MJCF attaches. Each has what
+        stands before the names of its links and joints in the model, once for each time that it is
+        attached.
     """
     if is_urdf(path):
-        return (UrdfSource(path=path, prefixes=("",)),)
+        return {path: ("",)}
 
     files: dict[str, Path] = {}
     attachments = []
     for including, element in elements_of(path):
         if element.tag == "model" and "file" in element.attrib:
-            file = included_file(path, including, element.attrib["file"])
-            root = None if file is None else _root(file)
-            if file is not None and root is not None:
+            included = included_file(path, including, element.attrib["file"])
+            if included is not None and (root := _root(included)) is not None:
                 # Without a stated name, a model has the one in its file.
-                files[element.get("name", root.get("name", ""))] = file
+                files[element.get("name", root.get("name", ""))] = included
         elif element.tag == "attach" and "model" in element.attrib:
             attachments.append((element.attrib["model"], element.get("prefix", "")))
 
-    found: dict[Path, list[str]] = {}
+    found: dict[Path, tuple[str, ...]] = {}
     for name, prefix in attachments:
-        if name in files and is_urdf(files[name]):
-            found.setdefault(files[name], []).append(prefix)
-    return tuple(UrdfSource(path=file, prefixes=tuple(each)) for file, each in found.items())
+        file = files.get(name)
+        if file is not None and is_urdf(file):
+            found[file] = (*found.get(file, ()), prefix)
+    return found
 
 
 def _root(path: Path) -> Any:

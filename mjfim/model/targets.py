@@ -48,6 +48,8 @@ class ModelField:
         column: Column of the number; None for arrays with one dimension.
         in_options: Whether the array belongs to `model.opt`.
         factor: The array holds this factor times the value.
+        size: Size with which a change is compared; 0 where only the value shows it. None where the
+            array decides.
         followers: Further numbers (array, row, column, factor) that are written with it, as the
             bias of a servo follows its gain.
     """
@@ -57,6 +59,7 @@ class ModelField:
     column: int | None = None
     in_options: bool = False
     factor: float = 1.0
+    size: float | None = None
     followers: tuple[tuple[str, int, int, float], ...] = ()
 
     @property
@@ -78,11 +81,13 @@ class ModelField:
         return float(number) / self.factor
 
     def magnitude(self, model: Any) -> float:
-        """Length with which a change of a position is compared; 0 where the value is compared.
+        """Size with which a change is compared; 0 where the value is compared.
 
         It is the radius of gyration [m] for a centre of mass, and the bounding radius [m] for the
         position of a geom.
         """
+        if self.size is not None:
+            return self.size
         row = self.rows[0]
         if self.array == "body_ipos" and model.body_mass[row] > 0.0:
             return body_inertia(model, row).gyration_radius

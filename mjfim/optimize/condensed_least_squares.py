@@ -379,6 +379,16 @@ class Condensed:
         J, _ = self._reduced_blocks
         return np.swapaxes(J, 1, 2) @ J
 
+    def _scatter(self, stretches: int) -> Array:
+        """(c, c) scatter of the gradients of some long stretches of rows."""
+        number = np.arange(len(self.blocks)) * stretches // len(self.blocks)
+        gradients = np.zeros((stretches, self.common_count))
+        np.add.at(gradients, number, self.block_scores)
+
+        # The gradient is zero at the minimum only, so that its mean does not count as scatter.
+        centred = gradients - gradients.mean(axis=0)
+        return np.asarray(centred.T @ centred * (stretches / (stretches - 1)))
+
     @property
     def true_deviation(self) -> float:
         """Ratio of the standard deviations to the formal ones.
@@ -392,13 +402,7 @@ class Condensed:
         if stretches < MIN_STRETCHES or not self.common_count:
             return 1.0
 
-        # The gradient is zero at the minimum only, so that its mean does not count as scatter.
-        number = np.arange(len(self.blocks)) * stretches // len(self.blocks)
-        gradients = np.zeros((stretches, self.common_count))
-        np.add.at(gradients, number, self.block_scores)
-        centred = gradients - gradients.mean(axis=0)
-        scatter = centred.T @ centred * (stretches / (stretches - 1))
-
+        scatter = self._scatter(stretches)
         scaled, scale = scaled_to_unit_diagonal(self.information())
         inverse = np.linalg.pinv(scaled, rcond=COMMON_RANK_COUNT_TOLERANCE, hermitian=True)
         formal = np.diag(inverse)

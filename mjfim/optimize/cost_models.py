@@ -59,20 +59,9 @@ MIN_NEWTON_FRACTION = 1e-8
 EQUAL_EIGENVALUES = 1e-6
 
 
-@record
-class BarrierDerivatives:
-    """Value and derivatives of the barrier of numbers, or of norms of vectors: (..., w).
-
-    Attributes:
-        value: Sum of the barrier over all numbers or vectors.
-        slope: (..., w) first derivative by each number.
-        curvature: (..., w) second derivative by each number; of a norm, (..., w, w) by the
-            components of its vector.
-    """
-
-    value: float
-    slope: Array
-    curvature: Array
+# Sum of the barrier over all numbers, or over all norms of vectors; its (..., w) slope by each;
+# its (..., w) curvature by each number, or (..., w, w) by the components of each vector.
+BarrierDerivatives = tuple[float, Array, Array]
 
 
 def relaxed_log_barrier(s: Array, delta: float) -> tuple[Array, Array, Array]:
@@ -253,7 +242,7 @@ class Bounds:
     def barrier(
         self, r: Array, delta: float, weight: float, factors: Array | None = None
     ) -> BarrierDerivatives:
-        """Barrier of numbers with its derivatives.
+        """Sum of the barrier of all numbers, with its derivatives.
 
         Args:
             r: (..., w) numbers.
@@ -281,7 +270,7 @@ class Bounds:
                 second = second * factors[side][..., bounded]
             curvature[..., bounded] += weight * second / scale**2
 
-        return BarrierDerivatives(value=value, slope=slope, curvature=curvature)
+        return value, slope, curvature
 
 
 class StepCurvature(Protocol):

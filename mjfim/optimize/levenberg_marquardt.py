@@ -357,7 +357,8 @@ def minimise(
     if condensed is None:
         return None
 
-    return _Search(problem, settings, budget or Budget(), callback, start, cost, condensed).run()
+    at = start, cost, condensed
+    return _Search(problem, settings, budget or Budget(), callback, at).run()
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -379,32 +380,32 @@ class _Trial:
     ratio: float
 
 
-@dataclass
 class _Search:
     """State of one search: the current point, its linearisation and the damping."""
 
-    problem: Problem
-    settings: SearchSettings
-    budget: Budget
-    callback: Callback | None
-    unknowns: UnknownValues
-    cost: float
-    condensed: Condensed
-    iteration: int = 0
-    damping: float = 0.0
-    damping_growth: float = 2.0
-    stagnant_iterations: int = 0
-    slow_iterations: int = 0
-    previous_length: float = ASSUMED_LENGTH
-    unit: float = 1.0
-
-    def __post_init__(self) -> None:
-        settings = self.settings
+    def __init__(
+        self,
+        problem: Problem,
+        settings: SearchSettings,
+        budget: Budget,
+        callback: Callback | None,
+        at: tuple[UnknownValues, float, Condensed],
+    ) -> None:
+        self.problem, self.settings, self.budget, self.callback = (
+            problem,
+            settings,
+            budget,
+            callback,
+        )
+        self.unknowns, self.cost, self.condensed = at
+        self.iteration = self.stagnant_iterations = self.slow_iterations = 0
+        self.damping, self.damping_growth = 0.0, 2.0
         if settings.damped:
             self.damping = WEAK_DAMPING if settings.begins_near else INITIAL_DAMPING
         # A length of many unknowns is compared with the root mean square of each.
         self.unknowns_length = float(np.sqrt(max(self.condensed.common_count, 1)))
-        self.unit_is_known = not settings.in_true_deviations
+        self.previous_length = ASSUMED_LENGTH
+        self.unit, self.unit_is_known = 1.0, not settings.in_true_deviations
         self.scale = self.condensed.column_norms
 
     def run(self) -> Solution:

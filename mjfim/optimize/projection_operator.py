@@ -6,7 +6,7 @@ The module knows arrays and two protocols, neither MuJoCo nor Fisher information
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Generic, Protocol, TypeVar
 
@@ -20,6 +20,7 @@ from mjfim.optimize.lq import (
     amplification_in_best_units,
     regulator,
 )
+from mjfim.parallel.budget import Budget
 from mjfim.records.design import Status
 
 P = TypeVar("P")
@@ -27,9 +28,14 @@ P = TypeVar("P")
 # Predicted decrease, relative to the cost, below which round-off hides the actual decrease.
 ROUND_OFF = 1e-12
 
-# Smallest factor by which the line search shortens a rejected step; the largest factor is a
-# setting.
-MIN_SHORTENING = 0.3
+# Smallest accepted share of the predicted decrease of a step (Armijo's rule).
+SUFFICIENT_DECREASE = 1e-4
+
+# Smallest and largest factor by which the line search shortens a rejected step.
+MIN_SHORTENING, MAX_SHORTENING = 0.3, 0.5
+
+# Largest number of steps that a line search tries.
+MAX_TRIALS = 30
 
 # Largest predicted decrease of the first trial step, relative to the scale of the cost.
 MAX_PREDICTED_DECREASE = 2.0
@@ -194,75 +200,57 @@ class Direction(Protocol):
         return False
 
 
-@record
-class Armijo:
-    """Backtracking line search until `J(gamma) <= J(0) + sigma gamma DJ.zeta`.
+def line_search(
+    problem: Problem[P],
+    point: P,
+    zeta: TangentCurve,
+    slope: float,
+    K: Array,
+    *,
+    budget: Budget,
+    first: float = 1.0,
+) -> tuple[P, float] | None:
+    """Search along a direction until `J(gamma) <= J(0) + SUFFICIENT_DECREASE gamma DJ.zeta`.
 
     A rejected gamma is shortened to the minimum of the parabola through J(0), the slope and
-    J(gamma), within [0.3, beta] gamma.
+    J(gamma), within [MIN_SHORTENING, MAX_SHORTENING] gamma.
 
-    Attributes:
-        sigma: Smallest accepted share of the predicted decrease.
-        beta: Largest factor by which a rejected step is shortened.
-        trials: Largest number of steps that are tried.
-        is_over: Whether the time is over; no further step is tried then.
+    Args:
+        problem: Cost and projection.
+        point: Point to start from.
+        zeta: Descent direction.
+        slope: Directional derivative DJ.zeta, negative.
+        K: (N, nu, nx) gain of the projection operator.
+        budget: Where it is exhausted, no further step is tried.
+        first: First step length.
+
+    Returns:
+        The accepted point and its gamma, or None where even the shortest step does not lower J
+        and where the time is over.
     """
+    value = problem.value(point)
+    gamma = first
 
-    sigma: float = 1e-4
-    beta: float = 0.5
-    trials: int = 30
-    is_over: Callable[[], bool] = lambda: False
+    for _ in range(MAX_TRIALS):
+        if gamma * abs(slope) <= ROUND_OFF * abs(value):
+            return None
 
-    def __post_init__(self) -> None:
-        if not (0.0 < self.sigma < 0.5 and 0.0 < self.beta < 1.0 and self.trials > 0):
-            raise ValueError("Armijo needs 0 < sigma < 0.5, 0 < beta < 1 and trials > 0")
+        trial = problem.project(point, zeta, gamma, K)
+        new = problem.value(trial)
+        if new <= value + SUFFICIENT_DECREASE * gamma * slope:
+            return trial, gamma
+        if budget.exhausted is not None:
+            return None
 
-    def search(
-        self,
-        problem: Problem[P],
-        point: P,
-        zeta: TangentCurve,
-        slope: float,
-        K: Array,
-        first: float = 1.0,
-    ) -> tuple[P, float] | None:
-        """Search along a direction.
+        # Minimum of the parabola. A diverged trial has none; its step is shortened as much as
+        # possible.
+        excess = new - value - gamma * slope
+        shorter = 0.0
+        if np.isfinite(new) and excess > 0.0:
+            shorter = -0.5 * slope * gamma**2 / excess
+        gamma = float(np.clip(shorter, MIN_SHORTENING * gamma, MAX_SHORTENING * gamma))
 
-        Args:
-            problem: Cost and projection.
-            point: Point to start from.
-            zeta: Descent direction.
-            slope: Directional derivative DJ.zeta, negative.
-            K: (N, nu, nx) gain of the projection operator.
-            first: First step length.
-
-        Returns:
-            The accepted point and its gamma, or None where even the shortest step does not lower J
-            and where the time is over.
-        """
-        value = problem.value(point)
-        gamma = first
-
-        for _ in range(self.trials):
-            if gamma * abs(slope) <= ROUND_OFF * abs(value):
-                return None
-
-            trial = problem.project(point, zeta, gamma, K)
-            new = problem.value(trial)
-            if new <= value + self.sigma * gamma * slope:
-                return trial, gamma
-            if self.is_over():
-                return None
-
-            # Minimum of the parabola. A diverged trial has none; its step is shortened as much as
-            # possible.
-            excess = new - value - gamma * slope
-            shorter = 0.0
-            if np.isfinite(new) and excess > 0.0:
-                shorter = -0.5 * slope * gamma**2 / excess
-            gamma = float(np.clip(shorter, MIN_SHORTENING * gamma, self.beta * gamma))
-
-        return None
+    return None
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -334,8 +322,8 @@ def optimize(
     start: P,
     direction: Direction,
     regulate: Regulator,
-    armijo: Armijo,
     *,
+    budget: Budget,
     tolerance: float,
     max_iterations: int,
 ) -> Iterator[Iterate[P]]:
@@ -346,7 +334,7 @@ def optimize(
         start: First point.
         direction: Chooses descent directions.
         regulate: Makes the gain of the projection operator.
-        armijo: Line search.
+        budget: Where it is exhausted, the line search ends.
         tolerance: The algorithm has converged where `|DJ.zeta| <= tolerance * size`.
         max_iterations: Largest number of accepted steps.
 
@@ -383,9 +371,9 @@ def optimize(
             # The line search begins with a shorter step then.
             if slope < 0.0:
                 first = min(1.0, -MAX_PREDICTED_DECREASE * size / slope)
-                found = armijo.search(problem, point, zeta, slope, K, first)
+                found = line_search(problem, point, zeta, slope, K, budget=budget, first=first)
 
-        if found is None and armijo.is_over():
+        if found is None and budget.exhausted is not None:
             return
 
         # More accurate derivatives may show a further descent. Where there are none and no step

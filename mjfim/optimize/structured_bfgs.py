@@ -6,6 +6,7 @@ by BFGS.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 
@@ -66,45 +67,48 @@ MUCH_SHORTENED = 0.5
 SMALLEST_SQUARE = 1e-300
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class CurveMetric:
-    """Metric on curve coordinates: a quadratic form on the tangent curves to which they lift.
+# Product of a matrix with coordinates of a step, or with m of them: of the same shape.
+Product = Callable[[Array], Array]
 
-    Attributes:
+# Products of the matrix of a metric, and of its inverse, with coordinates.
+Metric = tuple[Product, Product]
+
+
+def metric_of_curves(coordinates: CurveCoordinates, weights: Weights) -> Metric:
+    """Metric on (N, nu) curve coordinates: a quadratic form on the curves to which they lift.
+
+    Args:
         coordinates: Curve coordinates of the trajectory.
         weights: Quadratic form on tangent curves, positive on the controls.
     """
 
-    coordinates: CurveCoordinates
-    weights: Weights
+    def apply(s: Array) -> Array:
+        a, b = weights.half_gradient(coordinates.lift(s))
+        return coordinates.gradient(a, b)
 
-    def apply(self, s: Array) -> Array:
-        """Product of the metric's matrix with a curve coordinate.
-
-        Args:
-            s: (N, nu) curve coordinate, or (m, N, nu) for m of them.
-
-        Returns:
-            (N, nu) half of the gradient of the form, or (m, N, nu).
-        """
-        a, b = self.weights.half_gradient(self.coordinates.lift(s))
-        return self.coordinates.gradient(a, b)
-
-    def solve(self, g: Array) -> Array:
-        """Product of the inverse of the metric's matrix with a vector, by the Riccati equations.
-
-        Args:
-            g: (N, nu) vector, or (m, N, nu) for m of them.
-
-        Returns:
-            (N, nu) curve coordinate s with `apply(s) = g`, or (m, N, nu).
-        """
-        A, B, K = self.coordinates.A, self.coordinates.B, self.coordinates.K
+    def solve(g: Array) -> Array:
+        # The Riccati equations invert the metric.
+        A, B, K = coordinates.A, coordinates.B, coordinates.K
         *m, N, _ = g.shape
         a = np.zeros((*m, N + 1, K.shape[2]))
         a[..., :-1, :] = -products_at_samples(K.swapaxes(1, 2), g)
-        curve = RiccatiSolution.solve(A, B, self.weights).descent(a, -g)
-        return self.coordinates.coordinate(curve)
+        return coordinates.coordinate(RiccatiSolution.solve(A, B, weights).descent(a, -g))
+
+    return apply, solve
+
+
+def metric_of_matrix(H: Array) -> Metric:
+    """Metric on (M, nu) coefficients by a symmetric positive definite matrix: (M nu, M nu)."""
+
+    def apply(s: Array) -> Array:
+        return (s.reshape(-1, len(H)) @ H).reshape(s.shape)
+
+    def solve(g: Array) -> Array:
+        factor = scipy.linalg.cho_factor(H, lower=True)
+        columns = g.reshape(-1, len(H)).T
+        return np.asarray(scipy.linalg.cho_solve(factor, columns).T.reshape(g.shape))
+
+    return apply, solve
 
 
 def basis_response(expansion: Expansion, basis: Array) -> Array:
@@ -166,41 +170,6 @@ def basis_matrix(basis: Array, response: Array, weights: Weights) -> Array:
 
 
 @record
-class BasisMetric:
-    """Metric on the coefficients of a basis of controls, as a dense matrix.
-
-    Attributes:
-        H: (M nu, M nu) symmetric positive definite matrix.
-    """
-
-    H: Array
-
-    def apply(self, s: Array) -> Array:
-        """Product of the matrix with coefficients.
-
-        Args:
-            s: (M, nu) coefficients, or (m, M, nu) for m vectors of them.
-
-        Returns:
-            (M, nu) product, or (m, M, nu).
-        """
-        return (s.reshape(-1, len(self.H)) @ self.H).reshape(s.shape)
-
-    def solve(self, g: Array) -> Array:
-        """Product of the inverse of the matrix with a vector.
-
-        Args:
-            g: (M, nu) vector, or (m, M, nu) for m of them.
-
-        Returns:
-            (M, nu) coefficients s with `apply(s) = g`, or (m, M, nu).
-        """
-        columns = g.reshape(-1, len(self.H)).T
-        factor = scipy.linalg.cho_factor(self.H, lower=True)
-        return np.asarray(scipy.linalg.cho_solve(factor, columns).T.reshape(g.shape))
-
-
-@record
 class _LocalModel:
     """Gradients and metrics at a point.
 
@@ -227,7 +196,7 @@ class _LocalModel:
     eigenvalue_slopes: Array
     basis: Array | None
 
-    def metric(self, damping: float) -> CurveMetric | BasisMetric:
+    def metric(self, damping: float) -> Metric:
         """Metric of the weights plus a multiple of the uniform weights.
 
         Args:
@@ -240,12 +209,12 @@ class _LocalModel:
             weights = self.weights
             if damping > 0.0:
                 weights = weights.plus(self.barrier.uniform_weights, damping)
-            return CurveMetric(coordinates=self.coordinates, weights=weights)
+            return metric_of_curves(self.coordinates, weights)
 
         H, uniform_H = self._matrices
         if damping > 0.0:
             H = H + damping * uniform_H
-        return BasisMetric(H=H)
+        return metric_of_matrix(H)
 
     @cached_property
     def _matrices(self) -> tuple[Array, Array]:
@@ -386,12 +355,12 @@ class StructuredBFGS:
     def _step(self, here: _LocalModel) -> Array:
         """Minimum of the model, in its coordinates, with the present damping."""
         # Product of the inverse Hessian of metric and stored pairs with a vector.
-        metric = here.metric(self.damping)
+        apply, solve = here.metric(self.damping)
         pairs: list[CurvaturePair] = []
         if self._pairs:
             s, y = (np.stack(each) for each in zip(*self._pairs, strict=True))
-            pairs = convex_pairs(s, y + metric.apply(s), MIN_RELATIVE_CURVATURE)
-        inverse = partial(inverse_hessian_product, pairs=pairs, initial=metric.solve)
+            pairs = convex_pairs(s, y + apply(s), MIN_RELATIVE_CURVATURE)
+        inverse = partial(inverse_hessian_product, pairs=pairs, initial=solve)
 
         model = here.expansion.eigenvalue_model
         if model is None:

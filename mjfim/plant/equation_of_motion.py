@@ -89,13 +89,7 @@ class AffineForces:
             ctrl: (nu,) control about which it is moved.
             sizes: (2 nv + nu,) sizes of the coordinates.
         """
-        # A copy of a model with many meshes takes time.
-        unlimited = model
-        if model.actuator_forcelimited.any() or model.actuator_ctrllimited.any():
-            unlimited = copy.copy(model)
-            unlimited.actuator_forcelimited[:] = 0
-            unlimited.actuator_ctrllimited[:] = 0
-
+        unlimited = _without_limits(model)
         moves = RELATIVE_MOVE * sizes
         about = np.concatenate([state, ctrl])
         points = about + np.concatenate([np.zeros((1, len(moves))), np.diag(moves)])
@@ -320,19 +314,9 @@ class ParameterChange:
         )
 
 
-@record
-class MotionPoints:
-    """Points of a motion with their controls.
-
-    Attributes:
-        states: (n, ns) states.
-        acceleration: (n, nv) mean accelerations of the steps that begin there.
-        ctrl: (n, nu) controls.
-    """
-
-    states: Array
-    acceleration: Array
-    ctrl: Array
+# Points of a motion: (n, ns) states, (n, nv) mean accelerations of the steps that begin there, and
+# (n, nu) controls.
+MotionPoints = tuple[Array, Array, Array]
 
 
 @record
@@ -380,7 +364,8 @@ class EquationOfMotion:
             names.append("qDeriv")
         fields = self._fields(model, points, names)
 
-        inertial = (_mass(model, fields["M"]) @ points.acceleration[..., None])[..., 0]
+        _, acceleration, _ = points
+        inertial = (_mass(model, fields["M"]) @ acceleration[..., None])[..., 0]
         inertial += self._implicit_damping(model, fields, points)
         actuation = fields["qfrc_actuator"]
         friction = self._friction(model, points)
@@ -402,7 +387,8 @@ class EquationOfMotion:
             (nv, nv) root mean squares of `M_ij a_j`.
         """
         M = _mass(model, self._fields(model, points, ["M"])["M"])
-        forces = M * points.acceleration[:, None, :]
+        _, acceleration, _ = points
+        forces = M * acceleration[:, None, :]
         return np.asarray(np.sqrt(np.mean(forces**2, axis=0)))
 
     def moments(self, model: Any, points: MotionPoints, actuators: Sequence[int]) -> Array:
@@ -436,7 +422,7 @@ class EquationOfMotion:
             (n, nv) True where such a force acts on a degree of freedom.
         """
         if model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CONSTRAINT:
-            return np.zeros(points.acceleration.shape, dtype=bool)
+            return np.zeros(points[1].shape, dtype=bool)
 
         frictionless = copy.copy(model)
         frictionless.dof_frictionloss[:] = 0.0
@@ -446,27 +432,29 @@ class EquationOfMotion:
 
     def _fields(self, model: Any, points: MotionPoints, names: Sequence[str]) -> dict[str, Array]:
         """MjData fields at the n points, each (n, ...)."""
-        _, found = self.simulator.engine_steps(model, points.states, points.ctrl, names)
+        states, _, ctrl = points
+        _, found = self.simulator.engine_steps(model, states, ctrl, names)
         return {name: values[:, 0] for name, values in found.items()}
 
     def _implicit_damping(
         self, model: Any, fields: dict[str, Array], points: MotionPoints
     ) -> Array:
         """(n, nv) forces `τ B a`."""
+        states, acceleration, _ = points
         timestep = float(model.opt.timestep)
         if "qDeriv" in fields:
             D = _dense(fields["qDeriv"], model.D_rowadr, model.D_rownnz, model.D_colind, model.nv)
-            return -timestep * (D @ points.acceleration[..., None])[..., 0]
+            return -timestep * (D @ acceleration[..., None])[..., 0]
         if model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_EULERDAMP:
-            return np.zeros_like(points.acceleration)
+            return np.zeros_like(acceleration)
 
         # The slope of a damper with a force that is a polynomial of the speed.
-        speed = np.abs(self.simulator.space.split(points.states)[1])
+        speed = np.abs(self.simulator.space.split(states)[1])
         slope = np.broadcast_to(model.dof_damping, speed.shape).copy()
         polynomial = np.reshape(model.dof_dampingpoly, (model.nv, -1))
         for power in range(polynomial.shape[1]):
             slope += (power + 2) * polynomial[:, power] * speed ** (power + 1)
-        return timestep * slope * points.acceleration
+        return timestep * slope * acceleration
 
     def directions(self, speed: Array) -> Array:
         """Directions of dry friction along a motion.
@@ -482,7 +470,7 @@ class EquationOfMotion:
 
     def _friction(self, model: Any, points: MotionPoints) -> Array:
         """(n, nv) forces of dry friction of joints and tendons."""
-        speed = self.simulator.space.split(points.states)[1]
+        speed = self.simulator.space.split(points[0])[1]
         friction = -model.dof_frictionloss * self.directions(speed)
         if not model.tendon_frictionloss.any():
             return np.asarray(friction)
@@ -542,3 +530,14 @@ def _dense(values: Array, starts: Any, counts: Any, columns: Any, width: int) ->
         entries = slice(start, start + count)
         dense[:, row, columns[entries]] = values[:, entries]
     return dense
+
+
+def _without_limits(model: Any) -> Any:
+    """The model without limits of controls and of forces of actuators."""
+    # A copy of a model with many meshes takes time.
+    if not (model.actuator_forcelimited.any() or model.actuator_ctrllimited.any()):
+        return model
+    unlimited = copy.copy(model)
+    unlimited.actuator_forcelimited[:] = 0
+    unlimited.actuator_ctrllimited[:] = 0
+    return unlimited

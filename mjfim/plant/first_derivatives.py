@@ -260,6 +260,21 @@ class FirstDerivatives:
         without_theta = replace(found, E=np.zeros((*found.E.shape[:2], 0)))
         self.plant.closed_form_memory.latest = np.array(theta), trajectory, without_theta
 
+    def _change_by(
+        self, i: int, closed: ClosedForm, theta: Array, trajectory: Trajectory
+    ) -> ParameterChange | None:
+        """Change of the model by parameter i; None where MuJoCo cannot compile it."""
+        step = MODEL_STEP * self.plant.parameters.magnitude[i]
+        move = np.zeros(len(theta))
+        move[i] = step
+        pair, compiled = self.plant.try_models(np.stack([theta + move, theta - move]))
+        if not compiled.all():
+            return None
+        begin, parameter = trajectory.state[0], self.plant.parameters.parameters[i]
+        return closed.change_between(
+            pair, begin, trajectory.ctrl[0], 2.0 * step, is_inertial=is_inertial(parameter)
+        )
+
     def _change(
         self, closed: ClosedForm, theta: Array, trajectory: Trajectory
     ) -> ParameterChange | None:
@@ -270,19 +285,11 @@ class FirstDerivatives:
         if known is not None:
             return known
 
-        steps = MODEL_STEP * self.plant.parameters.magnitude
         changes = []
         for i in np.flatnonzero(memory.covered):
-            move = np.zeros(len(theta))
-            move[i] = steps[i]
-            pair, compiled = self.plant.try_models(np.stack([theta + move, theta - move]))
-            if not compiled.all():
+            change = self._change_by(int(i), closed, theta, trajectory)
+            if change is None:
                 return None
-            begin = trajectory.state[0], trajectory.ctrl[0]
-            parameter = self.plant.parameters.parameters[i]
-            change = closed.change_between(
-                pair, *begin, 2.0 * steps[i], is_inertial=is_inertial(parameter)
-            )
             changes.append(change)
 
         if len(memory.changes) >= MAX_KEPT_CHANGES:

@@ -45,24 +45,10 @@ ROUND_OFF = 1e-12
 LARGEST_REMAINDER = 1e-4
 
 
-@record
-class Response:
-    """Outputs of S curves over an interval of samples, and their derivatives.
-
-    Delays of the outputs are left out.
-
-    Attributes:
-        first: Sample of the curves at which the arrays begin.
-        y: (S, n+1, ny) outputs [y-unit].
-        common: (S, n+1, ny, p) derivative by theta [y-unit / theta-unit], or None if not requested.
-        private: (S, n+1, ny, k) derivative by directions of the initial state [y-unit / x-unit], or
-            None if not requested.
-    """
-
-    first: int
-    y: Array
-    common: Array | None
-    private: Array | None
+# Outputs of S curves over an interval of samples: (S, n+1, ny) [y-unit]; their derivatives by theta
+# (S, n+1, ny, p) [y-unit / theta-unit], and by k directions of the initial state (S, n+1, ny, k)
+# [y-unit / x-unit], None if not requested. Delays of the outputs are left out.
+Response = tuple[Array, Array | None, Array | None]
 
 
 class Derivatives(MixedDerivatives):
@@ -415,7 +401,7 @@ class Curves:
         if not (out.finite.all() and self._is_possible):
             return None
 
-        first, count = self.samples, held.shape[1] + 1
+        count = held.shape[1] + 1
         self.samples += held.shape[1]
         states = out.states.reshape(J, S, count, -1)
         sensors = None if out.sensors is None else out.sensors.reshape(J, S, count, -1)
@@ -424,7 +410,7 @@ class Curves:
         h_still = plant.outputs(*still)
         y = plant.calibration.measured(h_still, self._theta)
         if not self._with_derivatives:
-            return Response(first=first, y=y, common=None, private=None)
+            return y, None, None
 
         moved = None if sensors is None else sensors[1:]
         moves = self._derivatives.quotients(
@@ -433,11 +419,10 @@ class Curves:
         G = np.moveaxis(plant.outputs.tangent(states[0], *moves), 0, 3)
         common = np.zeros((*y.shape, len(self._theta)))
         common[..., self._moving] = G[..., : len(self._moving)]
-        return Response(
-            first=first,
-            y=y,
-            common=plant.calibration.by_theta(h_still, common, self._theta),
-            private=plant.calibration.scaled(G[..., len(self._moving) :], self._theta),
+        return (
+            y,
+            plant.calibration.by_theta(h_still, common, self._theta),
+            plant.calibration.scaled(G[..., len(self._moving) :], self._theta),
         )
 
 
@@ -446,6 +431,14 @@ def _columns(by_move: Array, is_moved: np.ndarray, lumped: LumpedParameters | No
     full = np.zeros((*by_move.shape[1:], len(is_moved)))
     full[..., is_moved] = np.moveaxis(by_move, 0, 2)
     return full if lumped is None else lumped.expanded(full[..., lumped.base])
+
+
+def _unit_directions(directions: Array) -> Array:
+    """(p, k) directions with a length of 1, without entries that are round-off."""
+    # A parameter that takes part in a direction by round-off only does not take part in it.
+    largest = np.abs(directions).max(axis=0)
+    relative = np.where(np.abs(directions) > ROUND_OFF * largest, directions, 0.0)
+    return np.asarray(relative / np.linalg.norm(relative, axis=0))
 
 
 @record
@@ -483,11 +476,7 @@ class LumpedParameters:
         if not k:
             return None
 
-        # A parameter that takes part in a direction by round-off only does not take part in it.
-        relative = directions / size[:, None]
-        largest = np.abs(relative).max(axis=0)
-        relative = np.where(np.abs(relative) > ROUND_OFF * largest, relative, 0.0)
-        unit = relative / np.linalg.norm(relative, axis=0)
+        unit = _unit_directions(directions / size[:, None])
         _, triangle, pivots = scipy.linalg.qr(unit.T, mode="economic", pivoting=True)
         diagonal = np.abs(np.diag(triangle))
         if not diagonal[k - 1] > LEAST_PIVOT_RATIO * diagonal[0]:

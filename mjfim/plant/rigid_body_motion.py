@@ -67,14 +67,6 @@ class RigidBodyMotion:
         centre = fields["xipos"][:, tree.bodies]
         origin = centre.mean(axis=1)
 
-        # A hinge moves the point at the origin by its distance from the axis, a slide along it.
-        axis = fields["xaxis"]
-        arm = fields["xanchor"] - origin[:, None]
-        hinge = tree.is_hinge[:, None]
-        joint_motion = np.concatenate(
-            [np.where(hinge, axis, 0.0), np.where(hinge, _cross(arm, axis), axis)], axis=2
-        )
-
         of_body = _spatial_inertia(
             model.body_mass[tree.bodies],
             centre - origin[:, None],
@@ -87,7 +79,7 @@ class RigidBodyMotion:
 
         return RigidBodyMotion(
             tree=tree,
-            joint_motion=joint_motion,
+            joint_motion=_joint_motion(tree, fields, origin),
             speed=speed,
             acceleration=acceleration,
             gravity=np.array(model.opt.gravity),
@@ -365,6 +357,17 @@ def _moved_force(v: Array, force: Array) -> Array:
     return np.concatenate(
         [_cross(v[..., :3], moment) + _cross(v[..., 3:], linear), _cross(v[..., :3], linear)],
         axis=-1,
+    )
+
+
+def _joint_motion(tree: JointTree, fields: dict[str, Array], origin: Array) -> Array:
+    """(n, nv, 6) spatial velocities of the bodies behind each joint per speed of the joint."""
+    # A hinge moves the point at the origin by its distance from the axis, a slide along it.
+    axis = fields["xaxis"]
+    arm = fields["xanchor"] - origin[:, None]
+    hinge = tree.is_hinge[:, None]
+    return np.concatenate(
+        [np.where(hinge, axis, 0.0), np.where(hinge, _cross(arm, axis), axis)], axis=2
     )
 
 

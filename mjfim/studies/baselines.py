@@ -125,6 +125,12 @@ def schroeder_phases(power: Array) -> Array:
     return -2.0 * np.pi * np.concatenate([[0.0], np.cumsum(np.cumsum(power / power.sum()))[:-1]])
 
 
+def harmonic_orders(highest: float, share: float) -> np.ndarray:
+    """Orders of a share of the harmonics up to a highest order; at least two of several."""
+    most = min(MAX_HARMONICS, max(int(highest), 1))
+    return np.arange(1, 1 + max(round(most * share), min(2, most)))
+
+
 def multisine(settings: ExcitationSettings, z: Array) -> Array:
     """A sum of harmonics with Schroeder phases for every actuator.
 
@@ -142,9 +148,7 @@ def multisine(settings: ExcitationSettings, z: Array) -> Array:
         base *= (0.5 * highest / base) ** z[0]
     amplitude, delay = z[3:].reshape(2, settings.nu)
 
-    most = min(MAX_HARMONICS, max(int(settings.max_frequency / base), 1))
-    count = max(round(most * z[1]), min(2, most))
-    order = np.arange(1, 1 + count)
+    order = harmonic_orders(settings.max_frequency / base, z[1])
     power = order ** (-2.0 * MAX_ROLL_OFF * z[2])
 
     delayed = settings.t[:, None, None] - (delay / base)[:, None]
@@ -293,7 +297,7 @@ def _search_at_random(
     settings = _settings(cost)
     count = 1 + counts[0] + counts[1] * settings.nu
     basis, window = bandwidth_basis(task, task.t), task.fade(task.samples)
-    bounds = cost.constraints.control.bounds
+    bounds = cost.level.constraints.control.bounds
     is_bounded = bool(np.isfinite(bounds.lower).all())
     largest = LARGEST_BOUNDED_SCALE if is_bounded else LARGEST_UNBOUNDED_SCALE
     has_weights = bool(task.control_weight.any() or task.tracking.any()) or not task.is_limited
@@ -319,8 +323,8 @@ def _search_at_random(
         if has_weights:
             scale *= SMALLEST_WEIGHTED_SCALE ** (1.0 - numbers[0])
         control = task.centre + scale * deviation
-        values = cost.values(control)
-        is_inside = values is not None and cost.constraints.is_feasible(values)
+        values = cost.level.values(control)
+        is_inside = values is not None and cost.level.constraints.is_feasible(values)
         point = cost.point_along(values) if is_inside or not task.is_limited else None
         J = np.inf if point is None else point.cost
 
@@ -344,7 +348,7 @@ def _settings(cost: LimitedCost) -> ExcitationSettings:
     experiment = task.experiment
     bandwidth = experiment.limits.bandwidth
     fastest = min(bandwidth or np.inf, 0.25 * experiment.rate, MAX_CYCLES / task.horizon)
-    is_smooth = cost.constraints.rate is not None or bandwidth is not None
+    is_smooth = cost.level.constraints.rate is not None or bandwidth is not None
     return ExcitationSettings(
         t=task.t,
         horizon=task.horizon,

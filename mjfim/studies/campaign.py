@@ -40,6 +40,7 @@ from mjfim.experiment.arguments import checked
 from mjfim.experiment.given import RecordingsLike, recordings_of
 from mjfim.experiment.schema import Experiment, ExperimentLike, experiment_of
 from mjfim.identification.identify import identify_system
+from mjfim.model.parameters import Parameter
 from mjfim.parallel import ExecutorLike, Workers
 from mjfim.parallel.budget import StopToken, stop_on_interrupt
 from mjfim.records.campaign import Campaign, CampaignStatus, EarlierRound, Round
@@ -119,20 +120,23 @@ def restate_experiment(
             tables[name] = table
             continue
         for j in members:
-            parameter = p.parameters[j]
-            member = {
-                "target": parameter.targets[0].path,
-                "unit": parameter.unit,
-                "nuisance": parameter.nuisance,
-            }
-            if parameter.prior is not None:
-                member["prior"] = parameter.prior
+            member = _member_table(p.parameters[j])
             tables[p.names[j]] = {**member, **_restated_keys(base, j, theta, estimate)}
 
     values = experiment.model_dump(exclude_unset=True)
     values["parameters"] = tables
     values["cost"] = {**values.get("cost", {}), "linearize_at": "guess"}
     return experiment.restated(values)
+
+
+def _member_table(parameter: Parameter) -> dict[str, Any]:
+    """Table of a single parameter of a declared inertia, without the keys of a redesign."""
+    table = {
+        "target": parameter.targets[0].path,
+        "unit": parameter.unit,
+        "nuisance": parameter.nuisance,
+    }
+    return table if parameter.prior is None else {**table, "prior": parameter.prior}
 
 
 def _restated_keys(
@@ -462,8 +466,8 @@ class _CampaignRun:
         names = self.base.parameters.names
         before = self.rounds[-1].estimate
         known = np.isfinite(before.std) & (before.std > 0.0)
-        change = np.zeros(len(names))
-        change[known] = np.abs(current.theta - before.theta)[known] / before.std[known]
+        moves = np.abs(current.theta - before.theta)
+        change = np.divide(moves, before.std, out=np.zeros(len(names)), where=known)
         for j in np.flatnonzero(change > SUSPICIOUS_CHANGE).tolist():
             yield (
                 f"{names[j]} moved from {before.theta[j]:.4g} to {current.theta[j]:.4g}, by "

@@ -52,6 +52,7 @@ from mjfim.information.criteria import shared
 from mjfim.information.finite_steps import valley, visible_columns
 from mjfim.information.fisher import FisherInformation
 from mjfim.information.identifiability import Identifiability, IdentifiabilityTest, RowsAndError
+from mjfim.model.control_laws import ControlLaws
 from mjfim.optimize.directions import LBFGS
 from mjfim.optimize.lq import LinearRecursion, TangentCurve
 from mjfim.parallel import ExecutorLike, one_blas_thread, results_on
@@ -216,6 +217,14 @@ def slope_error(task: DesignTask, problem: DesignProblem, point: DesignPoint) ->
 SWITCHES = ("gain:", "enable:")
 
 
+def _state_slopes(laws: ControlLaws, inputs: Array, dt: float) -> None:
+    """Set velocities of references, among inputs (N, w) that the caller owns, to their slopes."""
+    for law in laws.laws:
+        if "reference_velocity" in law.columns:
+            reference = inputs[:, law.columns["reference"]]
+            inputs[:, law.columns["reference_velocity"]] = np.gradient(reference, dt)
+
+
 def random_references(task: DesignTask, count: int) -> Iterator[Trajectory]:
     """Simulate closed loops under random multisines in place of the inputs of a log.
 
@@ -241,10 +250,7 @@ def random_references(task: DesignTask, count: int) -> Iterator[Trajectory]:
         wave = multisine(task.t, logged.shape[1], 1.0 / task.horizon, RANDOM_HARMONICS, rng)
         inputs = mean + share * peak * wave
         inputs[:, kept] = logged[:, kept]
-        for law in laws.laws:
-            if "reference_velocity" in law.columns:
-                reference = inputs[:, law.columns["reference"]]
-                inputs[:, law.columns["reference_velocity"]] = np.gradient(reference, task.dt)
+        _state_slopes(laws, inputs, task.dt)
         try:
             yield task.plant.simulate(task.theta, inputs)
         except SimulationDivergedError:

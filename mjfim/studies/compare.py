@@ -344,13 +344,12 @@ class MethodEvaluation:
 
         # A control that violates a limit of the unmodified model is made smaller.
         centre = self.task.centre
-        relaxed = DescentLevel(self.task.relaxed(), self.stage.basis)
-        search = InsideSearch(LimitedCost(level=relaxed), 0)
-        inside = search.largest(centre, control - centre, Budget())
+        relaxed = LimitedCost(level=DescentLevel(self.task.relaxed(), self.stage.basis))
+        inside = InsideSearch(relaxed, 0).largest(centre, control - centre, Budget())
         if inside is None:
             return evaluated
-        remark = ", ".join(filter(None, [note, f"shrunk to {100.0 * inside.share:.3g} %"]))
-        return self._evaluate(replace(nothing, note=remark), found, inside.control)
+        remarks = filter(None, [note, f"shrunk to {100.0 * inside.share:.3g} %"])
+        return self._evaluate(replace(nothing, note=", ".join(remarks)), found, inside.control)
 
     def _evaluate(self, nothing: MethodResult, found: SearchResult, control: Array) -> MethodResult:
         """Evaluate a control without changing it; `nothing` where the simulation diverges.

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -62,31 +63,33 @@ def read_urdf(
     if not joints:
         raise ModelError(f"{path}: the URDF has no revolute or prismatic joint that a motor drives")
 
-    def mjcf(file: str) -> str:
-        """Text of the MJCF; the path of the URDF is relative to it or absolute."""
-        element = ElementTree.SubElement
-        root = ElementTree.Element("mujoco", model=f"{spec.modelname} with motors")
-        root.append(ElementTree.Comment(COMMENT))
-        if packages:
-            custom = element(root, "custom")
-            for name, folder in packages.items():
-                element(custom, "text", name=f"{PACKAGE}{name}", data=folder)
-        element(element(root, "asset"), "model", name="robot", file=file)
-        element(element(root, "worldbody"), "attach", model="robot", prefix="")
-
-        # The range of a motor is that of the force of its joint, where the URDF states one.
-        actuators = element(root, "actuator")
-        for joint in joints:
-            attributes = {"name": joint.name, "joint": joint.name}
-            low, high = map(float, joint.actfrcrange)
-            if low < high:
-                attributes["ctrlrange"] = f"{low:.9g} {high:.9g}"
-            element(actuators, "motor", attributes)
-
-        ElementTree.indent(root)
-        return ElementTree.tostring(root, encoding="unicode") + "\n"
-
+    mjcf = partial(_with_motors, spec.modelname, joints, packages)
     return mjcf, _velocities(path)
+
+
+def _with_motors(name: str, joints: Sequence[Any], packages: Mapping[str, str], file: str) -> str:
+    """Text of the MJCF of a URDF, by its relative or absolute path, with motors at joints."""
+    element = ElementTree.SubElement
+    root = ElementTree.Element("mujoco", model=f"{name} with motors")
+    root.append(ElementTree.Comment(COMMENT))
+    if packages:
+        custom = element(root, "custom")
+        for name, folder in packages.items():
+            element(custom, "text", name=f"{PACKAGE}{name}", data=folder)
+    element(element(root, "asset"), "model", name="robot", file=file)
+    element(element(root, "worldbody"), "attach", model="robot", prefix="")
+
+    # The range of a motor is that of the force of its joint, where the URDF states one.
+    actuators = element(root, "actuator")
+    for joint in joints:
+        attributes = {"name": joint.name, "joint": joint.name}
+        low, high = map(float, joint.actfrcrange)
+        if low < high:
+            attributes["ctrlrange"] = f"{low:.9g} {high:.9g}"
+        element(actuators, "motor", attributes)
+
+    ElementTree.indent(root)
+    return ElementTree.tostring(root, encoding="unicode") + "\n"
 
 
 def _velocities(path: Path) -> dict[str, float]:
@@ -397,18 +400,24 @@ def require_carrier(model: Any, name: str) -> int:
     return body
 
 
+def _load_size(model: Any, mass: float, length: float, period: float) -> float:
+    """Mass of a load that is usual at a body of some mass [kg]."""
+    # A light wrist carries more than a share of its own mass.
+    moving = model.body_mass[model.body_weldid > 0].sum()
+    size = max(PAYLOAD_SHARE * mass, STRENGTH_SHARE * moving)
+    gravity = np.linalg.norm(model.opt.gravity)
+    if gravity > 0.0 and model.nu:
+        torques = _strengths(model, period) * np.where(translations(model), length, 1.0)
+        size = max(size, STRENGTH_SHARE * torques.max() / (gravity * length))
+    return float(size)
+
+
 def _payload(model: Any, name: str, length: float, period: float) -> Iterator[Candidate]:
     """Mass and first moments of an unknown payload that is fixed to a body."""
     body = require_carrier(model, name)
     mass = float(model.body_mass[body])
     radius = body_inertia(model, body).gyration_radius
-    # A light wrist carries more than a share of its own mass.
-    moving = model.body_mass[model.body_weldid > 0].sum()
-    scale = max(PAYLOAD_SHARE * mass, STRENGTH_SHARE * moving)
-    gravity = np.linalg.norm(model.opt.gravity)
-    if gravity > 0.0 and model.nu:
-        torques = _strengths(model, period) * np.where(translations(model), length, 1.0)
-        scale = max(scale, STRENGTH_SHARE * torques.max() / (gravity * length))
+    scale = _load_size(model, mass, length, period)
     yield Candidate(
         name="payload",
         group="payload",
@@ -515,17 +524,16 @@ def _inertia(model: Any) -> Iterator[Candidate]:
 
 def _joint_fields(model: Any, group: Group, period: float) -> Iterator[Candidate]:
     """Fields of joints; those that are zero in the model have a natural size."""
-    forces, sizes = STRENGTH_SHARE * _strengths(model, period), position_sizes(model)
+    forces = STRENGTH_SHARE * _strengths(model, period)
+    sizes, speed = position_sizes(model), 2.0 * np.pi / period
     for quantity, array, meaning in JOINT_FIELDS[group]:
         # A force of friction, over a natural speed or acceleration.
         power = {"damping": 1, "armature": 2}.get(quantity, 0)
-        natural = (2.0 * np.pi / period) ** power
         for joint in range(model.njnt):
             name, dof = element_name(model, "joint", joint), model.jnt_dofadr[joint]
             value = float(getattr(model, array)[dof])
-            is_single = joint_dofs(model, joint) == 1
-            size = float(forces[dof] / natural / sizes[dof] ** (power > 0))
-            if name and (value > 0.0 or is_single):
+            size = float(forces[dof] / speed**power / sizes[dof] ** (power > 0))
+            if name and (value > 0.0 or joint_dofs(model, joint) == 1):
                 yield Candidate(
                     name=f"{name}_{quantity}",
                     group=group,

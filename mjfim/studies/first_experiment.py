@@ -179,20 +179,22 @@ class Proposal:
         """The compiled model."""
         return self.source.model
 
-    def values(self) -> dict[str, Any]:
-        """Keys and tables of the experiment file."""
-        initial = {}
+    def _initial_state(self) -> dict[str, Any]:
+        """Keys of the table `[initial]` that state the initial state."""
         if self.release is not None:
             qpos, free = self.release
-            initial["qpos"] = qpos.tolist()
-            initial["free"] = {name: list(ends) for name, ends in free.items()}
-        elif self.start.keyframe is not None:
-            initial["keyframe"] = self.start.keyframe
-        else:
-            initial["qpos"] = [rounded(q, STATE_DIGITS) for q in self.start.qpos]
-            if self.start.act.any():
-                initial["act"] = [rounded(act, STATE_DIGITS) for act in self.start.act]
+            ranges = {name: list(ends) for name, ends in free.items()}
+            return {"qpos": qpos.tolist(), "free": ranges}
+        if self.start.keyframe is not None:
+            return {"keyframe": self.start.keyframe}
+        state = {"qpos": [rounded(q, STATE_DIGITS) for q in self.start.qpos]}
+        if self.start.act.any():
+            state["act"] = [rounded(act, STATE_DIGITS) for act in self.start.act]
+        return state
 
+    def values(self) -> dict[str, Any]:
+        """Keys and tables of the experiment file."""
+        initial = self._initial_state()
         values = {
             "model": self.model,
             "rate": self.times.rate,
@@ -653,7 +655,7 @@ class _Refinement:
         task = self._task(system, draft)
         model, substeps = self.source.model, task.system.grid.substeps
         controls = np.repeat(task.control, substeps, axis=0)
-        sizes, change = position_sizes(model), np.zeros(model.nv)
+        sizes = position_sizes(model)
         rng = np.random.default_rng(0)
         undisturbed = played(model, draft.start, controls)[0][substeps::substeps]
 
@@ -664,12 +666,8 @@ class _Refinement:
             direction = rng.standard_normal(model.nv)
             moved = DISTURBANCE * sizes * direction / np.linalg.norm(direction)
             disturbed = played(model, draft.start, controls, moved)[0][substeps::substeps]
-            samples = min(samples, len(disturbed))
-            for k in range(samples):
-                mujoco.mj_differentiatePos(model, change, 1.0, undisturbed[k], disturbed[k])
-                if np.linalg.norm(change / sizes) > largest * DISTURBANCE:
-                    samples = k
-                    break
+            most = largest * DISTURBANCE
+            samples = _samples_near(model, undisturbed[:samples], disturbed, sizes, most)
         least = round(SHORTEST_MOTION * draft.times.period * draft.times.rate)
         return min(max(samples, least), draft.times.samples)
 
@@ -874,6 +872,11 @@ def _about(proposal: Proposal) -> dict[str, list[str]]:
         others = [name for name in names if name and name != start.near]
         initial += [f"Other keyframes: {', '.join(others)}."] if others else []
 
+    return {"noise": noise, "initial": initial, "limits": _about_limits(model)}
+
+
+def _about_limits(model: Any) -> list[str]:
+    """Comments about the limits of a model (`mujoco.MjModel`)."""
     limits = []
     kinds = dict.fromkeys(limit.kind.replace("_", " ") for limit in limits_of_model(model))
     if kinds:
@@ -887,7 +890,7 @@ def _about(proposal: Proposal) -> dict[str, list[str]]:
     ]
     if any(kind in QUATERNION_PLACE for kind in model.jnt_type.tolist()):
         limits.append("Of free and ball joints also: tilt, angular_velocity, in radians.")
-    return {"noise": noise, "initial": initial, "limits": limits}
+    return limits
 
 
 def _table(
@@ -939,3 +942,21 @@ def _add_others(table: Any, proposal: Proposal) -> None:
 def _meaning(model: Any, each: Candidate) -> str:
     unit = unit_of(model, each.paths[0])
     return f"{each.meaning} [{unit}]" if unit else each.meaning
+
+
+def _samples_near(model: Any, one: Array, other: Array, sizes: Array, most: float) -> int:
+    """Samples of two motions, (n, nq) and (m, nq), until they are apart by more than a distance.
+
+    Args:
+        model: The compiled model (`mujoco.MjModel`).
+        one: Positions of the one motion.
+        other: Positions of the other one.
+        sizes: (nv,) sizes of the coordinates.
+        most: The distance, in these sizes.
+    """
+    change, count = np.zeros(model.nv), min(len(one), len(other))
+    for k in range(count):
+        mujoco.mj_differentiatePos(model, change, 1.0, one[k], other[k])
+        if np.linalg.norm(change / sizes) > most:
+            return k
+    return count

@@ -163,7 +163,7 @@ def _widened(model: Any, positions: Array, lengths: Array) -> dict[str, Any]:
 
     A stop is soft: where the start is outside, the range is widened by some times the excess.
     """
-    found: dict[str, dict[str, list[float]]] = {}
+    found: dict[str, Any] = {}
     for limit in limits_of_model(model):
         if limit.kind not in SOFT_KINDS or limit.is_magnitude:
             continue
@@ -171,11 +171,10 @@ def _widened(model: Any, positions: Array, lengths: Array) -> dict[str, Any]:
         ends = np.array([limit.lower, limit.upper])
         excess = np.array([min(values.min() - ends[0], 0.0), max(values.max() - ends[1], 0.0)])
         most = SOFT_SHARE * (ends[1] - ends[0])
-        begins_outside = not limit.lower <= values[0] <= limit.upper
-        if begins_outside and (np.abs(excess) < most).all():
+        if not limit.lower <= values[0] <= limit.upper and (np.abs(excess) < most).all():
             wider = ends + np.clip(SOFT_ROOM * excess, -most, most)
             found.setdefault(limit.kind, {})[limit.name] = [rounded(end, 6) for end in wider]
-    return {**found}
+    return found
 
 
 def _clearance(source: ModelSource, positions: Array, least: float) -> dict[str, Any]:
@@ -189,7 +188,7 @@ def _clearance(source: ModelSource, positions: Array, least: float) -> dict[str,
         least: The least distance [m].
     """
     model, stated = source.model, {"clearance": least}
-    height = find_floor(model, positions[0]).height
+    height, _, _ = find_floor(model, positions[0])
     height = rounded(height, 6) if abs(height) > ZERO_HEIGHT * least else 0.0
     # A stated floor is a height over z, and that of the rehearsal one against gravity.
     is_upright = model.opt.gravity[2] <= 0.0 and not model.opt.gravity[:2].any()

@@ -101,7 +101,7 @@ def _outputs(source: ModelSource) -> Iterator[ListedOutput]:
         yield ListedOutput(name=component.name, source="state", unit=component.unit, noise=0.0)
 
     for number in coordinates.sensors:
-        sensor = identifier(model, "sensor", number.sensor)
+        sensor = identifier(model, "sensor", number.groups[0])
         kind = mujoco.mjtSensor(model.sensor_type[sensor])
         yield ListedOutput(
             name=number.name,
@@ -185,9 +185,7 @@ def stated_experiment(experiment: Experiment) -> StatedExperiment:
     """
     system = System.resolve(experiment)
 
-    missing = []
-    if experiment.horizon is None:
-        missing.append("horizon")
+    missing = ["horizon"] if experiment.horizon is None else []
     if experiment.initial.control is None and system.controls:
         missing.append("initial.control")
 

@@ -9,8 +9,9 @@ prior knowledge with its covariance, so that the uncertainty of the robot is par
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -52,27 +53,6 @@ REPLACED_KEYS = ("guess", "prior", "cad_prior", "inertial", "coordinates", "scal
 
 
 @record
-class PayloadPlace:
-    """Place at which a payload is fixed, and sizes of the robot from which its search starts.
-
-    Attributes:
-        body: Name of the body that carries it.
-        term: Name of the term, which no element of the model has.
-        names: Names of its parameters, by field.
-        mass: Mass at which the search starts [kg].
-        centre: (3,) centre of mass at which it starts, in the frame of the body [m].
-        length: Length of the robot, which bounds the centre of mass loosely [m].
-    """
-
-    body: str
-    term: str
-    names: Mapping[str, str]
-    mass: float
-    centre: tuple[float, ...]
-    length: float
-
-
-@record
 class RobotExperiment:
     """The experiment of a robot without its payload.
 
@@ -100,19 +80,7 @@ class RobotExperiment:
         """
         values = experiment.model_dump(exclude_unset=True)
         loads = {name: spec for name, spec in experiment.terms.items() if spec.kind == KIND}
-        prefixes = tuple(f"term/{name}:" for name in loads)
-
-        gone = set()
-        for name, spec in experiment.parameters.items():
-            of_load = [target.path.startswith(prefixes) for target in spec.all_targets]
-            if any(of_load):
-                if not all(of_load):
-                    raise ExperimentError(
-                        f"{experiment.source}: parameters.{name}: sets numbers of the payload and "
-                        "of the robot; separate the two"
-                    )
-                gone.add(name)
-
+        gone = set(_parameters_of_terms(experiment, loads))
         values["terms"] = {k: v for k, v in values.get("terms", {}).items() if k not in loads}
         parameters = {k: v for k, v in values["parameters"].items() if k not in gone}
         # Values that differ from recording to recording remain a nuisance.
@@ -159,8 +127,8 @@ class RobotExperiment:
                 tables[parameter] = {**kept, **place, "guess": guess}
         return tables
 
-    def place(self, body: str | None) -> PayloadPlace:
-        """Find the body that carries the payload.
+    def carrier(self, body: str | None) -> str:
+        """Name of the body that carries the payload.
 
         Args:
             body: Its name; None for the one at which the experiment states a payload.
@@ -185,22 +153,30 @@ class RobotExperiment:
         number = identifier(model, "body", body)
         if number < 0:
             raise ExperimentError(f"body: {unknown('body', body, names_of(model, 'body'))}")
-        group = model.body_weldid[number]
-        if group == 0:
+        if model.body_weldid[number] == 0:
             raise ExperimentError(
                 f"body: {body!r} does not move, so that a payload has no effect; valid: "
                 f"{listed(moving)}"
             )
+        return body
 
-        used = self.values["parameters"]
-        return PayloadPlace(
-            body=body,
-            term=free_name(KIND, {*names_of(model, "body"), *self.values["terms"]}),
-            names={field: free_name(f"payload_{field}", used) for field in FIELDS},
-            mass=PAYLOAD_SHARE * float(model.body_subtreemass[group]),
-            centre=tuple(model.body_ipos[number].tolist()),
-            length=model_length(model),
-        )
+
+def _parameters_of_terms(experiment: Experiment, terms: Iterable[str]) -> Iterator[str]:
+    """Names of the tables of parameters that set numbers of some terms.
+
+    Raises:
+        ExperimentError: A parameter sets numbers of a term and of the robot.
+    """
+    prefixes = tuple(f"term/{name}:" for name in terms)
+    for name, spec in experiment.parameters.items():
+        of_terms = [target.path.startswith(prefixes) for target in spec.all_targets]
+        if any(of_terms) and not all(of_terms):
+            raise ExperimentError(
+                f"{experiment.source}: parameters.{name}: sets numbers of the payload and "
+                "of the robot; separate the two"
+            )
+        if any(of_terms):
+            yield name
 
 
 def parameters_of(name: str, spec: ParameterSpec) -> list[tuple[str, str | None]]:
@@ -306,7 +282,7 @@ class PayloadTask:
 
     Attributes:
         robot: The experiment of the robot.
-        place: Where the payload is.
+        body: Name of the body that carries the payload.
         earlier: Earlier estimate of the robot, or None.
         size: Edge of the cube of which the payload has the volume [m], or None.
         threads: Threads for the engine, or None.
@@ -314,7 +290,7 @@ class PayloadTask:
     """
 
     robot: RobotExperiment
-    place: PayloadPlace
+    body: str
     earlier: Estimate | None
     size: float | None
     threads: int | None
@@ -345,7 +321,7 @@ class PayloadTask:
         stated = RobotExperiment.of(experiment)
         task = cls(
             robot=stated,
-            place=stated.place(body),
+            body=stated.carrier(body),
             earlier=robot,
             size=size,
             threads=threads,
@@ -359,6 +335,29 @@ class PayloadTask:
                 f"{listed(known)}. Identify the robot with this experiment"
             )
         return task
+
+    @cached_property
+    def term(self) -> str:
+        """Name of the term, which no element of the model has."""
+        bodies = names_of(model_of(self.robot.stated_by).model, "body")
+        return free_name(KIND, {*bodies, *self.robot.values["terms"]})
+
+    @cached_property
+    def names(self) -> dict[str, str]:
+        """Names of the parameters of the payload, by field."""
+        used = self.robot.values["parameters"]
+        return {field: free_name(f"payload_{field}", used) for field in FIELDS}
+
+    @cached_property
+    def start(self) -> tuple[float, list[float], float]:
+        """Mass [kg] and centre of mass in the frame of the body [m] at which a search starts.
+
+        The last number is the length of the robot [m], which bounds the centre of mass loosely.
+        """
+        model = model_of(self.robot.stated_by).model
+        number = identifier(model, "body", self.body)
+        mass = PAYLOAD_SHARE * float(model.body_subtreemass[model.body_weldid[number]])
+        return mass, model.body_ipos[number].tolist(), model_length(model)
 
     def system(self, known: KnownRobot | None = None) -> System:
         """The robot with the payload.
@@ -391,9 +390,8 @@ class PayloadTask:
 
             # First with any inertia, which needs to be known only where recordings show it.
             begin_stage("fitting the payload")
-            system = self.system(known)
             budget = Budget(stop=token)
-            task = FitTask.of(system, recordings)
+            task = FitTask.of(self.system(known), recordings)
             search = FitSearch(task=task, budget=budget, callback=callback)
             fit, edge = fit_task(search), None
             if not self._determines_inertia(fit) and not token.requested:
@@ -401,10 +399,13 @@ class PayloadTask:
             estimate = estimate_from(fit, budget, refuted=())
 
         system = fit.task.system
-        payload = self._payload(estimate, known, edge)
-        seconds = time.perf_counter() - begun
-        steps = system.plant.engine_steps
-        return replace(estimate, payload=payload, seconds=seconds, steps=steps), system
+        found = replace(
+            estimate,
+            payload=self._payload(estimate, known, edge),
+            seconds=time.perf_counter() - begun,
+            steps=system.plant.engine_steps,
+        )
+        return found, system
 
     # ---- the robot
 
@@ -491,8 +492,8 @@ class PayloadTask:
         values = {**self.robot.values, "parameters": {**payload, **tables}}
         values["fit"] = {**self.robot.values["fit"], "hold": known.held}
         if payload:
-            term = {"kind": KIND, "body": self.place.body}
-            values["terms"] = {**self.robot.values["terms"], self.place.term: term}
+            term = {"kind": KIND, "body": self.body}
+            values["terms"] = {**self.robot.values["terms"], self.term: term}
 
         system = System.resolve(self.robot.stated_by.restated(values), threads=self.threads)
         if not known.known:
@@ -512,14 +513,15 @@ class PayloadTask:
             values: Values at which the search starts, by field; default: from the robot's sizes.
             inertia: Assumed rotational inertia, known to as much [kg m²]; None where it is free.
         """
-        place = self.place
-        default = {"mass": place.mass, "inertia": place.mass * self._edge(place.mass) ** 2 / 6.0}
-        start = {**default, **dict(zip(AXES, place.centre, strict=True)), **(values or {})}
+        mass, centre, length = self.start
+        inertia_of_cube = mass * self._edge(mass) ** 2 / 6.0
+        start = {"mass": mass, "inertia": inertia_of_cube, **(values or {})}
+        start |= zip(AXES, centre, strict=True)
         tables = {}
-        for field, name in place.names.items():
-            table = {"target": f"term/{place.term}:{field}", "guess": start[field]}
+        for field, name in self.names.items():
+            table = {"target": f"term/{self.term}:{field}", "guess": start[field]}
             if field in AXES:
-                table |= {"guess": place.centre[AXES.index(field)], "prior": place.length}
+                table["prior"] = length
             if field == "inertia" and inertia is not None:
                 table |= {"guess": inertia, "prior": inertia, "nuisance": True}
             tables[name] = table
@@ -530,11 +532,17 @@ class PayloadTask:
         return self.size if self.size is not None else float(np.cbrt(mass / DENSITY))
 
     def _determines_inertia(self, fit: FitResult) -> bool:
-        j = fit.task.system.parameters.names.index(self.place.names["inertia"])
+        j = fit.task.system.parameters.names.index(self.names["inertia"])
         value = float(fit.theta[j])
         half_width = np.abs(fit.accuracy.interval[j] - value).max()
         is_known = np.isfinite(fit.accuracy.std[j]) and value > 0.0
         return bool(is_known and half_width <= DETERMINED_SHARE * value)
+
+    def _plausible_mass(self, fit: FitResult, j: int) -> float:
+        """Mass of the payload, parameter j of a fit, not too small for its interval [kg]."""
+        high = float(fit.accuracy.interval[j, 1])
+        mass = max(float(fit.theta[j]), 0.5 * high if np.isfinite(high) else 0.0)
+        return mass or self.start[0]
 
     def _with_assumed_inertia(
         self, known: KnownRobot, fit: FitResult, search: FitSearch
@@ -549,11 +557,8 @@ class PayloadTask:
             search: Its search.
         """
         names = fit.task.system.parameters.names
-        index = {field: names.index(name) for field, name in self.place.names.items()}
-        high = float(fit.accuracy.interval[index["mass"], 1])
-        mass = max(float(fit.theta[index["mass"]]), 0.5 * high if np.isfinite(high) else 0.0)
-        mass = mass or self.place.mass
-
+        index = {field: names.index(name) for field, name in self.names.items()}
+        mass = self._plausible_mass(fit, index["mass"])
         edge = self._edge(mass)
         inertia = mass * edge**2 / 6.0
         values = {field: float(fit.theta[j]) for field, j in index.items()}
@@ -576,12 +581,12 @@ class PayloadTask:
         self, estimate: Estimate, known: KnownRobot, edge: float | None
     ) -> PayloadEstimate:
         """The payload of an estimate."""
-        index = {field: estimate.parameters.index(name) for field, name in self.place.names.items()}
+        index = {field: estimate.parameters.index(name) for field, name in self.names.items()}
         axes = [index[axis] for axis in AXES]
         half_widths = 0.5 * np.diff(estimate.interval[axes], axis=1).ravel()
-        is_determined = half_widths < UNDETERMINED_SHARE * NORMAL_95 * self.place.length
+        is_determined = half_widths < UNDETERMINED_SHARE * NORMAL_95 * self.start[2]
         return PayloadEstimate(
-            body=self.place.body,
+            body=self.body,
             mass=float(estimate.theta[index["mass"]]),
             mass_interval=estimate.interval[index["mass"]],
             centre=estimate.theta[axes],

@@ -155,6 +155,17 @@ def values_of(model: FittedModel) -> dict[str, float]:
     return dict(zip(names, model.result.theta.tolist(), strict=True))
 
 
+def _with_pools(values: dict[str, float], pooled: Iterable[PooledParameter]) -> dict[str, float]:
+    """Values with those of pooled parameters: the means of what their members suggest."""
+    found = dict(values)
+    for pool in pooled:
+        members = zip(pool.members, pool.scales, strict=True)
+        suggested = [found[name] / scale for name, scale in members if name in found]
+        if suggested and pool.name not in found:
+            found[pool.name] = float(np.mean(suggested))
+    return found
+
+
 def start_of(
     parameters: ParameterSet, model: FittedModel, added: Term | None = None, share: float = 1.0
 ) -> Array:
@@ -170,12 +181,7 @@ def start_of(
         added: The new term.
         share: Share of the estimated sizes of the term with which it begins.
     """
-    values = values_of(model)
-    for pool in model.pooled:
-        members = zip(pool.members, pool.scales, strict=True)
-        suggested = [values[name] / scale for name, scale in members if name in values]
-        if suggested and pool.name not in values:
-            values[pool.name] = float(np.mean(suggested))
+    values = _with_pools(values_of(model), model.pooled)
     changes = {
         number.name: (share if number.is_size else 1.0) * number.value
         for number in (() if added is None else added.numbers)

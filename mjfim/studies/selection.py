@@ -342,8 +342,11 @@ class _Selector:
                 ]
                 better = better or self._best_extension(model, attempt)
             if better is None or self._is_stopped():
-                text = "No further term predicts left-out data clearly better."
-                self.ending = INTERRUPTED if self._is_stopped() else text + tests.remark
+                self.ending = (
+                    INTERRUPTED
+                    if self._is_stopped()
+                    else f"No further term predicts left-out data clearly better.{tests.remark}"
+                )
                 return model
             model = better
         self.ending = f"{self.max_terms} terms were added, the largest number."
@@ -483,11 +486,7 @@ class _Selector:
             share=candidate.share,
             joints=candidate.joints,
         )
-        found = fit.result
-        is_ended = found.solution.success and not found.solution.slow
-        is_comparable = have_same_initial_states(found.problem, model.result.problem)
-        is_comparable &= found.task.noise_is_stated and is_ended
-        if is_comparable and 0.0 <= fit.cost - model.cost <= EQUAL_COST:
+        if _are_comparable(model, fit) and 0.0 <= fit.cost - model.cost <= EQUAL_COST:
             self.steps.append(step)
             return None
         extended = self._assessed(fit)
@@ -565,3 +564,11 @@ class _Selector:
 
     def _is_stopped(self) -> bool:
         return self.budget.stop.requested
+
+
+def _are_comparable(model: FittedModel, fit: FittedModel) -> bool:
+    """Whether the cost of a fit with more terms can be compared with that of a model."""
+    found = fit.result
+    is_ended = found.solution.success and not found.solution.slow
+    same_states = have_same_initial_states(found.problem, model.result.problem)
+    return same_states and found.task.noise_is_stated and is_ended

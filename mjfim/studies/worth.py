@@ -180,7 +180,8 @@ def _with_sensors(system: System, add: Mapping[str, float]) -> tuple[System, lis
 
     # The noise that the MJCF states counts only where the experiment states none.
     experiment = system.experiment
-    known = {each.sensor: each.sigma for each in stated.coordinates.sensors if each.sigma > 0.0}
+    sensors = stated.coordinates.sensors
+    known = {each.groups[0]: each.sigma for each in sensors if each.sigma > 0.0}
     own = dict(experiment.noise) or ({} if experiment.correlated else known)
     source = ModelSource(stated.path, spec, stated.files)
     source.contents = stated.contents

@@ -119,10 +119,10 @@ def test_the_barrier_alone_steers_a_control_inside(tmp_path: Path) -> None:
     task = cart_inside(tmp_path, limits=limits, initial=initial, horizon=0.5).relaxed()
     ground = Ground.of(DescentLevel(task, None))
     outside = np.full_like(task.control, -0.8)
-    assert not ground.constraints.is_feasible(ground.values(outside))
+    assert not ground.level.constraints.is_feasible(ground.level.values(outside))
     for strictly, least in ((False, -1.0), (True, 0.0)):
         inside = ground.begin(outside, Budget(), strictly=strictly)
-        margins = ground.constraints.relative_margins(ground.values(inside))
+        margins = ground.level.constraints.relative_margins(ground.level.values(inside))
         assert min(margins.values()) > least
 
 

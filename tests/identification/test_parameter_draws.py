@@ -19,7 +19,7 @@ from mjfim.identification.assessment.parameter_draws import (
     draw_parameters,
     draw_parameters_system,
 )
-from mjfim.identification.linear_coordinates import CadPrior, unknown_bodies
+from mjfim.identification.linear_coordinates import cad_bodies, cad_information, unknown_bodies
 from mjfim.model.inertia import barycentric_of, logcholesky_derivatives
 from mjfim.records.estimate import ParameterDraws
 from mjfim.records.events import stages_observed_by
@@ -179,7 +179,7 @@ class KnownMoment:
         self.rows[1, 10] = 1.0
         self.rows /= self.combinations(guess[None])[:, 0, None]
         data = self.rows.T @ self.rows / KNOWN**2
-        known = CadPrior.of(parameters).information(guess) + parameters.prior_information
+        known = cad_information(cad_bodies(parameters), guess) + parameters.prior_information
 
         # The coordinates differ in their units, so that the inverse of the scaled matrix is exact.
         scaled, scale = scaled_to_unit_diagonal(data + known)

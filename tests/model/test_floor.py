@@ -41,8 +41,8 @@ def test_the_floor_under_a_robot(option: str, bodies: str, height: float, is_sta
     model = mujoco.MjModel.from_xml_string(
         f"<mujoco>{option}<worldbody>{bodies}</worldbody></mujoco>"
     )
-    found = find_floor(model, model.qpos0)
-    assert found.height == pytest.approx(height, abs=1e-12)
-    assert found.is_stated is is_stated
+    found, stated, _ = find_floor(model, model.qpos0)
+    assert found == pytest.approx(height, abs=1e-12)
+    assert stated is is_stated
     # A height that is known holds.
-    assert find_floor(model, model.qpos0, 0.3).height == 0.3
+    assert find_floor(model, model.qpos0, 0.3)[0] == 0.3

@@ -81,14 +81,15 @@ def test_the_barrier_of_bounds_is_the_sum_over_both_bounds(delta: float) -> None
         beta = relaxed_log_barrier(np.where(np.isfinite(sides), sides, 1.0), delta)[0]
         return 0.25 * beta.sum(axis=0)
 
-    barrier, up, down = (bounds.barrier(r + move, delta, 0.25) for move in (0.0, h, -h))
-    assert barrier.value == pytest.approx(values(r).sum(), rel=1e-12)
-    slope = (values(r + h) - values(r - h)) / (2 * h)
-    assert_allclose(barrier.slope, slope, rtol=1e-6, atol=1e-6)
-    assert_allclose(barrier.curvature, (up.slope - down.slope) / (2 * h), rtol=1e-4)
-    assert not barrier.slope[:, 3].any() and not barrier.curvature[:, 3].any()  # no bound
+    value, slope, curvature = bounds.barrier(r, delta, 0.25)
+    up, down = (bounds.barrier(r + move, delta, 0.25)[1] for move in (h, -h))
+    assert value == pytest.approx(values(r).sum(), rel=1e-12)
+    difference = (values(r + h) - values(r - h)) / (2 * h)
+    assert_allclose(slope, difference, rtol=1e-6, atol=1e-6)
+    assert_allclose(curvature, (up - down) / (2 * h), rtol=1e-4)
+    assert not slope[:, 3].any() and not curvature[:, 3].any()  # no bound
     middle = Bounds.from_range(np.array([-1.0]), np.array([3.0])).barrier(np.ones((1, 1)), 0.1, 1.0)
-    assert (middle.value, middle.slope.item()) == (0.0, 0.0)
+    assert (middle[0], middle[1].item()) == (0.0, 0.0)
 
 
 def test_the_largest_relative_move_is_over_observations_and_controls() -> None:

@@ -19,13 +19,14 @@ from mjfim.optimize import projection_operator
 from mjfim.optimize.directions import LBFGS, MetricDescent
 from mjfim.optimize.lq import TangentCurve, amplification_in_best_units
 from mjfim.optimize.projection_operator import (
-    Armijo,
     Direction,
     Expansion,
     Iterate,
     Regulator,
+    line_search,
     optimize,
 )
+from mjfim.parallel.budget import Budget, StopReason
 from mjfim.records.design import Status
 from tests.support.numerics import Array
 
@@ -137,7 +138,7 @@ def run(problem: Any, direction: Direction, **changes: Any) -> list[Iterate[Curv
     """All iterates of a run."""
     settings = {
         "regulate": REGULATOR,
-        "armijo": Armijo(),
+        "budget": Budget(),
         "tolerance": 1e-12,
         "max_iterations": 200,
         **changes,
@@ -248,7 +249,7 @@ class Upwards:
 
 
 def searched(
-    problem: Pendulum, factor: float, armijo: Armijo, first: float = 1.0
+    problem: Pendulum, factor: float, first: float = 1.0, budget: Any = None
 ) -> tuple[tuple[Curve, float] | None, float, float]:
     """Search along a multiple of the metric direction.
 
@@ -257,7 +258,9 @@ def searched(
     """
     point, expansion, K, zeta = begun(problem, METRIC)
     along, slope = TangentCurve(z=factor * zeta.z, v=factor * zeta.v), expansion.slope(zeta)
-    found = armijo.search(problem, point, along, abs(factor) * slope, K, first)
+    found = line_search(
+        problem, point, along, abs(factor) * slope, K, budget=budget or Budget(), first=first
+    )
     return found, problem.value(point), slope
 
 
@@ -265,11 +268,12 @@ def searched(
 @pytest.mark.parametrize("factor", [1.0, 10.0, 100.0, 1e4])
 @pytest.mark.parametrize("sigma", [1e-4, 0.3])
 def test_armijo_accepts_a_step_of_sufficient_decrease_however_long_the_direction(
-    factor: float, sigma: float, wall: float, first: float
+    factor: float, sigma: float, wall: float, first: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Beyond the wall, trials diverge."""
+    monkeypatch.setattr(projection_operator, "SUFFICIENT_DECREASE", sigma)
     problem = Pendulum(wall=wall)
-    (trial, gamma), value, slope = searched(problem, factor, Armijo(sigma=sigma), first)
+    (trial, gamma), value, slope = searched(problem, factor, first)
     assert 0.0 < gamma <= first
 
     # Between J at the start and the one that is asked for after the accepted one.
@@ -281,35 +285,31 @@ def test_armijo_accepts_a_step_of_sufficient_decrease_however_long_the_direction
     assert (problem.value(trial), gamma) == (problem.values[-3], problem.gammas[-1])
 
 
-def test_armijo_gives_up_on_an_ascent_direction_that_claims_to_descend() -> None:
+def test_armijo_gives_up_on_an_ascent_direction_that_claims_to_descend(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """It accepts no step that is too short to change the cost."""
     problem = Pendulum()
-    assert searched(problem, -1.0, Armijo(trials=12))[0] is None
+    monkeypatch.setattr(projection_operator, "MAX_TRIALS", 12)
+    assert searched(problem, -1.0)[0] is None
     assert len(problem.values) == 14  # the start, every trial, and the start again
-    found, value, _ = searched(problem, -1.0, Armijo(trials=100))
+    monkeypatch.setattr(projection_operator, "MAX_TRIALS", 100)
+    found, value, _ = searched(problem, -1.0)
     assert found is None or problem.value(found[0]) < value
 
 
 def test_the_line_search_ends_with_its_time_and_the_descent_with_its_last_iterate() -> None:
-    problem, asked = Pendulum(), iter([False, False, True])
-    assert searched(problem, -1.0, Armijo(is_over=lambda: next(asked)))[0] is None
+    problem, asked = Pendulum(), iter([None, None, StopReason.SECONDS])
+    short = type("Short", (), {"exhausted": property(lambda _: next(asked))})()
+    assert searched(problem, -1.0, budget=short)[0] is None
     assert len(problem.values) == 5  # three trials between the start and itself
 
     # An ascent direction is not called converged.
-    iterates = run(Pendulum(), Upwards(), armijo=Armijo(is_over=lambda: True))
+    iterates = run(Pendulum(), Upwards(), budget=Budget(seconds=0.0))
     assert [iterate.status for iterate in iterates] == [None]
     iterates = run(Pendulum(), Upwards(), max_iterations=5)
     assert iterates[-1].status is not Status.CONVERGED
     assert iterates[-1].value <= iterates[0].value
-
-
-@pytest.mark.parametrize(
-    "settings",
-    [{"sigma": 0.0}, {"sigma": 0.5}, {"sigma": -1.0}, {"beta": 0.0}, {"beta": 1.0}, {"trials": 0}],
-)
-def test_armijo_refuses_settings_that_cannot_work(settings: Any) -> None:
-    with pytest.raises(ValueError, match="Armijo needs"):
-        Armijo(**settings)
 
 
 def learned(memory: int, iterations: int = 9) -> tuple[LBFGS, Expansion, Array]:

@@ -16,19 +16,21 @@ from scipy.optimize import minimize
 from mjfim.optimize.cost_models import BarrierDerivatives, BarrierExpansion, Bounds
 from mjfim.optimize.lq import CurveCoordinates, LinearRecursion, TangentCurve, Weights
 from mjfim.optimize.projection_operator import (
-    Armijo,
     Expansion,
     Iterate,
     Regulator,
     optimize,
 )
 from mjfim.optimize.structured_bfgs import (
-    BasisMetric,
-    CurveMetric,
+    Metric,
+    Product,
     StructuredBFGS,
     basis_matrix,
     basis_response,
+    metric_of_curves,
+    metric_of_matrix,
 )
+from mjfim.parallel.budget import Budget
 from mjfim.records.design import Status
 from tests.support.lq import random_system, random_weights
 from tests.support.numerics import Array, relative_error
@@ -43,23 +45,21 @@ def random_expansion(rng: np.random.Generator) -> tuple[Expansion, Weights]:
     return expansion, random_weights(rng, N, NX, NU, steps=True)
 
 
-def basis_metric(expansion: Expansion, weights: Weights, basis: Array) -> BasisMetric:
+def basis_metric(expansion: Expansion, weights: Weights, basis: Array) -> Metric:
     """Metric of a quadratic form on the coefficients of a basis."""
-    return BasisMetric(H=basis_matrix(basis, basis_response(expansion, basis), weights))
+    return metric_of_matrix(basis_matrix(basis, basis_response(expansion, basis), weights))
 
 
-def curve_metric(expansion: Expansion, weights: Weights, K: Array | float = 0.0) -> CurveMetric:
+def curve_metric(expansion: Expansion, weights: Weights, K: Array | float = 0.0) -> Metric:
     """Metric of a quadratic form on the control, with feedback."""
     gains = np.zeros((N, NU, NX)) + K
-    return CurveMetric(
-        coordinates=CurveCoordinates(A=expansion.A, B=expansion.B, K=gains), weights=weights
-    )
+    return metric_of_curves(CurveCoordinates(A=expansion.A, B=expansion.B, K=gains), weights)
 
 
-def dense(metric: CurveMetric) -> Array:
+def dense(product: Product) -> Array:
     """(N nu, N nu) matrix of a metric, from its product with every unit step."""
     units = np.eye(N * NU).reshape(-1, N, NU)
-    return np.stack([metric.apply(e).reshape(-1) for e in units], axis=1)
+    return np.stack([product(e).reshape(-1) for e in units], axis=1)
 
 
 def test_a_linearised_motion_that_explodes_has_no_direction() -> None:
@@ -75,25 +75,21 @@ def test_a_metric_is_symmetric_positive_and_its_solve_inverts_it(feedback: bool)
     rng = np.random.default_rng(1)
     expansion, weights = random_expansion(rng)
     K = feedback * 0.3 * rng.normal(size=(N, NU, NX))
-    metric = curve_metric(expansion, weights, K)
-    H = dense(metric)
+    apply, solve = curve_metric(expansion, weights, K)
+    H = dense(apply)
     assert_allclose(H, H.T, rtol=0, atol=1e-9 * np.abs(H).max())
     assert np.linalg.eigvalsh(H)[0] > 0.0
     g = rng.normal(size=(N, NU))
-    assert_allclose(
-        metric.solve(g).reshape(-1), np.linalg.solve(H, g.reshape(-1)), rtol=1e-7, atol=1e-9
-    )
+    assert_allclose(solve(g).reshape(-1), np.linalg.solve(H, g.reshape(-1)), rtol=1e-7, atol=1e-9)
     many = rng.normal(size=(3, N, NU))
-    solved = [metric.solve(each) for each in many]
-    assert_allclose(metric.solve(many), solved, rtol=1e-9, atol=1e-12)
+    solved = [solve(each) for each in many]
+    assert_allclose(solve(many), solved, rtol=1e-9, atol=1e-12)
 
     # its own form on the curve that a step makes
     s = rng.normal(size=(N, NU))
     zeta = expansion.lift(K, s)
     a, b = weights.half_gradient(zeta)
-    assert np.vdot(s, metric.apply(s)) == pytest.approx(
-        np.sum(a * zeta.z) + np.sum(b * zeta.v), rel=1e-10
-    )
+    assert np.vdot(s, apply(s)) == pytest.approx(np.sum(a * zeta.z) + np.sum(b * zeta.v), rel=1e-10)
 
 
 @pytest.mark.parametrize("basis", [np.eye(N), np.random.default_rng(4).normal(size=(N, 5))])
@@ -103,14 +99,15 @@ def test_the_metric_of_a_basis_is_the_projected_metric(basis: Array) -> None:
     expansion, weights = random_expansion(rng)
     weights.Q[4:9], weights.S[4:9], weights.W[::2] = 0.0, 0.0, 0.0
     wide = np.kron(basis, np.eye(NU))
-    H = wide.T @ dense(curve_metric(expansion, weights)) @ wide
-    based = basis_metric(expansion, weights, basis)
-    assert relative_error(based.H, H) < 1e-9
+    H = wide.T @ dense(curve_metric(expansion, weights)[0]) @ wide
+    apply, solve = basis_metric(expansion, weights, basis)
+    units = np.eye(len(H)).reshape(-1, basis.shape[1], NU)
+    assert relative_error(apply(units).reshape(H.shape), H) < 1e-9
     many = rng.normal(size=(3, basis.shape[1], NU))
     solved = np.linalg.solve(H, many.reshape(3, -1, 1)).reshape(many.shape)
     for g, exact in ((many, solved), (many[0], solved[0])):
-        assert relative_error(based.solve(g), exact) < 1e-7
-        assert relative_error(based.apply(exact), g) < 1e-7
+        assert relative_error(solve(g), exact) < 1e-7
+        assert relative_error(apply(exact), g) < 1e-7
 
 
 # A linear plant: an oscillator with a third state, and two controls.
@@ -154,7 +151,7 @@ class Toy:
     def value(self, point: SimpleNamespace) -> float:
         """Sum of cost and barrier."""
         cost = 0.01 * np.sum((point.x[1:] - WANTED) ** 2) + 1e-4 * np.sum(point.u**2)
-        return cost + sum(barrier.value for barrier in self.barriers(point))
+        return cost + sum(value for value, _, _ in self.barriers(point))
 
     def size(self, point: SimpleNamespace) -> float:
         """Scale of a change of the cost."""
@@ -164,15 +161,15 @@ class Toy:
         """Derivatives of cost and barrier, and the curvature of the barrier only."""
         a = np.zeros((N + 1, NX))
         a[1:] = 0.02 * (point.x[1:] - WANTED)
-        shown, held, rated = self.barriers(point)
+        (_, shown, bent), (_, held, held_bent), (_, rated, W) = self.barriers(point)
         Q, R = np.zeros((N + 1, NX, NX)), np.zeros((N, NU, NU))
-        Q[1:, 0, 0], R[:, range(NU), range(NU)] = shown.curvature[:, 0], held.curvature
+        Q[1:, 0, 0], R[:, range(NU), range(NU)] = bent[:, 0], held_bent
         of_states = np.zeros_like(a)
-        of_states[1:, 0] = shown.slope[:, 0]
+        of_states[1:, 0] = shown[:, 0]
         barrier = BarrierExpansion(
             a=of_states,
-            b=held.slope + rated.slope[:-1] - rated.slope[1:],
-            weights=Weights(Q=Q, S=np.zeros((N, NU, NX)), R=R, W=rated.curvature),
+            b=held + rated[:-1] - rated[1:],
+            weights=Weights(Q=Q, S=np.zeros((N, NU, NX)), R=R, W=W),
             observations=np.concatenate([A, B], axis=2)[:, None, :1],
             control_scale=CONTROL.scale,
             control_step_scale=RATE.scale,
@@ -205,7 +202,13 @@ def optimised(
     """All iterates from a control of zeros."""
     begin = toy.point(np.zeros((N, NU)))
     steps = optimize(
-        toy, begin, direction, regulate, Armijo(), tolerance=tolerance, max_iterations=150
+        toy,
+        begin,
+        direction,
+        regulate,
+        budget=Budget(),
+        tolerance=tolerance,
+        max_iterations=150,
     )
     return list(steps)
 

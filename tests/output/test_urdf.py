@@ -214,8 +214,7 @@ def test_a_urdf_that_is_attached_twice_is_not_written(tmp_path: Path) -> None:
     )
     (tmp_path / "driven.xml").write_text(twice, encoding="utf-8")
     both = resolved(tmp_path, "driven.xml", {"m": {"target": "body/a_upper:mass"}})
-    (source,) = urdf_sources(both.model_path)
-    assert source.prefixes == ("a_", "b_")
+    assert list(urdf_sources(both.model_path).values()) == [("a_", "b_")]
     (remark,) = written(tmp_path / "out", both, np.array([1.6]))
     assert "is attached 2 times, and one URDF has one set of values" in remark
     assert names(tmp_path / "out") == {"identified.xml"}

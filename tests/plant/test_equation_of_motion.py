@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -73,11 +72,8 @@ def random_points(task: Any, count: int = 5) -> MotionPoints:
     rng = np.random.default_rng(3)
     space, start = task.system.space, task.system.nominal_initial_state
     states = space.plus(np.tile(start, (count, 1)), 0.5 * rng.standard_normal((count, space.nx)))
-    return MotionPoints(
-        states=states,
-        acceleration=rng.standard_normal((count, space.nv)),
-        ctrl=0.3 * rng.standard_normal((count, task.system.plant.nu)),
-    )
+    acceleration = rng.standard_normal((count, space.nv))
+    return states, acceleration, 0.3 * rng.standard_normal((count, task.system.plant.nu))
 
 
 @pytest.mark.parametrize("integrator", ["Euler", "implicit", "implicitfast", "RK4"])
@@ -97,10 +93,10 @@ def test_needed_forces_are_those_of_mujocos_inverse_dynamics(
         inverse.opt.enableflags |= int(mujoco.mjtEnableBit.mjENBL_INVDISCRETE)
     data = mujoco.MjData(inverse)
     nv = model.nv
-    for k, state in enumerate(points.states):
+    for k, (state, acceleration, ctrl) in enumerate(zip(*points, strict=True)):
         data.qpos[:], data.qvel[:] = state[: model.nq], state[model.nq : model.nq + nv]
-        data.ctrl[:] = points.ctrl[k]
-        data.qacc[:] = points.acceleration[k]
+        data.ctrl[:] = ctrl
+        data.qacc[:] = acceleration
         mujoco.mj_inverse(inverse, data)
         free = 6 if build is body_task and integrator.startswith("implicit") else 0
         found, expected = terms.needed[k][free:], data.qfrc_inverse[free:]
@@ -114,16 +110,13 @@ def test_steps_of_the_engine_fulfil_the_equation(integrator: str, tmp_path: Path
     equation, model = unconstrained(task)
     trajectory = task.plant.simulate(task.parameters.guess, task.control)
     timestep = float(model.opt.timestep)
-    points = MotionPoints(
-        states=trajectory.state[:-1],
-        acceleration=np.diff(trajectory.qvel, axis=0) / timestep,
-        ctrl=task.control,
-    )
+    states, acceleration = trajectory.state[:-1], np.diff(trajectory.qvel, axis=0) / timestep
+    points = states, acceleration, task.control
     terms = equation.terms(model, points)
 
     # Near rest, the friction of the engine is not that of sliding.
-    belt = points.states[:, 2] - 0.5 * points.states[:, 3]
-    moves = (np.abs(points.states[:, 2]) > 0.05) & (np.abs(belt) > 0.05)
+    belt = states[:, 2] - 0.5 * states[:, 3]
+    moves = (np.abs(states[:, 2]) > 0.05) & (np.abs(belt) > 0.05)
     assert moves.sum() > 40
     error = np.abs(terms.needed - terms.actuation)[moves]
     assert np.quantile(error, 0.9) < 1e-6 * np.abs(terms.needed).max()
@@ -140,10 +133,10 @@ def test_stops_are_found_and_friction_is_not_a_stop(tmp_path: Path) -> None:
     task = servo_task(tmp_path, text)
     equation, _ = unconstrained(task)
     points = random_points(task)
-    states = np.array(points.states)
+    states, acceleration, _ = points
     states[:, 1] = [0.0, 1.0, 0.0, -1.0, 0.0]
     ctrl = np.outer(states[:, 1], [0.0, 1.0])
-    moved = replace(points, states=states, ctrl=ctrl)
+    moved = states, acceleration, ctrl
     found = equation.constrained(task.plant.model(task.theta), moved)
     assert_array_equal(found[:, 1], [False, True, False, True, False])
 

@@ -15,7 +15,7 @@ from mjfim.errors import ExperimentError
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.system import System
 from mjfim.identification.assessment.honest_covariance import honest_covariance
-from mjfim.identification.linear_coordinates import CadPrior
+from mjfim.identification.linear_coordinates import cad_bodies, cad_information, columns_of
 from mjfim.studies.payload import PayloadTask, RobotExperiment
 from tests.identification.test_parameter_draws import estimated
 from tests.support.made_records import bare_estimate
@@ -127,7 +127,7 @@ def test_a_payload_that_the_experiment_states_is_left_out_of_the_robot(tmp_path:
     assert tuple(robot.shared) == tuple(ROBOT)
     assert robot.experiment.terms == {}
     assert robot.experiment.fit.hold == ()
-    assert robot.place(None).body == "hand"
+    assert robot.carrier(None) == "hand"
 
     mixed = {"targets": [{"path": "term/load:mass"}, {"path": "body/upper:mass"}]}
     with pytest.raises(ExperimentError, match=r"parameters\.both: sets numbers of the payload"):
@@ -145,23 +145,23 @@ def test_a_prior_from_the_model_counts_once(tmp_path: Path) -> None:
     whole = experiment(tmp_path).restated(values)
     system = System.resolve(whole)
     parameters = system.parameters
-    cad = CadPrior.of(parameters)
-    assert len(cad.bodies) == 2
-    others = np.setdiff1d(np.arange(len(parameters)), cad.columns)
+    bodies = cad_bodies(parameters)
+    assert len(bodies) == 2
+    others = np.setdiff1d(np.arange(len(parameters)), columns_of(bodies))
     row = np.random.default_rng(1).standard_normal(len(parameters)) / parameters.magnitude
     data = np.outer(row, row)
     data[others, others] += 1e4 / parameters.magnitude[others] ** 2
-    covariance = np.linalg.inv(data + cad.information(parameters.guess))
+    covariance = np.linalg.inv(data + cad_information(bodies, parameters.guess))
     estimate = estimated(system, covariance, data=data, honest_covariance=covariance)
 
     loaded = PayloadTask.of(whole, body="hand", robot=estimate).system()
     found = loaded.parameters
     index = [found.names.index(name) for name in parameters.names]
-    prior = found.prior_information + CadPrior.of(found).information(found.guess)
+    prior = found.prior_information + cad_information(cad_bodies(found), found.guess)
     inverse = np.linalg.inv(covariance)
     size = np.sqrt(np.outer(np.diag(inverse), np.diag(inverse)))
     assert_allclose(prior[np.ix_(index, index)] / size, inverse / size, atol=1e-5)
-    assert not CadPrior.of(found).bodies
+    assert not cad_bodies(found)
 
     # The numbers of the link without the load mean the same in both models.
     theta, moved = np.array(found.guess), parameters.guess + 0.1 * parameters.magnitude

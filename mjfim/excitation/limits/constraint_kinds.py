@@ -81,22 +81,18 @@ class Magnitude:
         vectors = observed[..., self.columns]
         norm = np.linalg.norm(vectors, axis=-1, keepdims=True)
         bounds = self.bounds(upper, scale)
-        found = bounds.barrier(norm, delta, weight)
+        value, slope, curvature = bounds.barrier(norm, delta, weight)
 
         # At zero, slope over norm tends to the curvature.
         is_zero = norm <= NEARLY_ZERO * bounds.scale
         safe = np.where(is_zero, 1.0, norm)
-        across = np.where(is_zero, found.curvature, found.slope / safe)
+        across = np.where(is_zero, curvature, slope / safe)
         direction = np.where(is_zero, 0.0, vectors / safe)
 
         outer = direction[..., :, None] * direction[..., None, :]
         identity = np.eye(len(self.columns))
-        bend = (found.curvature - across)[..., None]
-        return BarrierDerivatives(
-            value=found.value,
-            slope=across * vectors,
-            curvature=across[..., None] * identity + bend * outer,
-        )
+        bend = (curvature - across)[..., None]
+        return value, across * vectors, across[..., None] * identity + bend * outer
 
 
 # Weight of a constraint on the final state in the barrier. A constraint that holds at every sample
@@ -156,32 +152,9 @@ class KindMargins(NamedTuple):
     scale: Array | float
 
 
-@record
-class ExpansionSums:
-    """Gradient and Gauss-Newton Hessian of the barrier.
-
-    Every kind of constraint adds its part in place.
-
-    Attributes:
-        a: (N+1, nx) derivative by the state [1 / x-unit].
-        b: (N, nu) derivative by the control [1 / u-unit].
-        weights: The Hessian as a quadratic form on tangent curves.
-    """
-
-    a: Array
-    b: Array
-    weights: Weights
-
-    @staticmethod
-    def zero(N: int, nx: int, nu: int) -> ExpansionSums:
-        """Zero sums for N samples, nx states and nu controls."""
-        weights = Weights(
-            Q=np.zeros((N + 1, nx, nx)),
-            S=np.zeros((N, nu, nx)),
-            R=np.zeros((N, nu, nu)),
-            W=np.zeros((N + 1, nu)),
-        )
-        return ExpansionSums(a=np.zeros((N + 1, nx)), b=np.zeros((N, nu)), weights=weights)
+# Derivatives of the barrier by the state (N+1, nx) [1 / x-unit] and by the control (N, nu)
+# [1 / u-unit], and its Gauss-Newton Hessian. Every kind of constraint adds its part in place.
+ExpansionSums = tuple[Array, Array, Weights]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -376,9 +349,9 @@ class SubstepConstraint(Constraint):
         self, values: ConstraintValues, delta: float, factors: Array | None = None
     ) -> BarrierDerivatives:
         """See `Constraint.barrier`; the value counts magnitudes as well."""
-        numbers = super().barrier(values, delta, factors)
-        vectors = (each.value for _, each in self._vector_barriers(values, delta))
-        return replace(numbers, value=numbers.value + sum(vectors))
+        value, slope, curvature = super().barrier(values, delta, factors)
+        vectors = (each[0] for _, each in self._vector_barriers(values, delta))
+        return value + sum(vectors), slope, curvature
 
     def narrowing(self, values: ConstraintValues, delta: float) -> Array:
         """See `Constraint.narrowing`; angles count as the norms from which they are computed."""
@@ -398,26 +371,27 @@ class SubstepConstraint(Constraint):
         # Slope of the barrier by every observed number, and its curvature times the Jacobian.
         jacobian = values.jacobian
         slope, bent = np.zeros(jacobian.shape[:3]), np.zeros(jacobian.shape)
-        numbers, columns = super().barrier(values, delta, factors), self.number_columns
-        slope[..., columns] = numbers.slope
-        bent[:, :, columns] = numbers.curvature[..., None] * jacobian[:, :, columns]
-        for i, vectors in self._vector_barriers(values, delta):
+        columns = self.number_columns
+        _, slope[..., columns], curvature = super().barrier(values, delta, factors)
+        bent[:, :, columns] = curvature[..., None] * jacobian[:, :, columns]
+        for i, (_, slopes, curvature) in self._vector_barriers(values, delta):
             columns = np.array(self.columns[i])
-            slope[..., columns] = vectors.slope
-            bent[:, :, columns] = vectors.curvature @ jacobian[:, :, columns]
+            slope[..., columns] = slopes
+            bent[:, :, columns] = curvature @ jacobian[:, :, columns]
 
         # Gradient by the state and the control, (N, nx+nu).
-        N, nx = len(jacobian), sums.a.shape[1]
+        a, b, weights = sums
+        N, nx = len(jacobian), a.shape[1]
         gradient = np.einsum("kswi,ksw->ki", jacobian, slope)
-        sums.a[:-1] += gradient[:, :nx]
-        sums.b[:] += gradient[:, nx:]
+        a[:-1] += gradient[:, :nx]
+        b += gradient[:, nx:]
 
         # Gauss-Newton Hessian J' (curvature) J of every sample, with all numbers in rows.
         flat = jacobian.reshape(N, -1, jacobian.shape[-1])
         hessian = np.swapaxes(bent.reshape(flat.shape), 1, 2) @ flat
-        sums.weights.Q[:-1] += hessian[:, :nx, :nx]
-        sums.weights.S[:] += hessian[:, nx:, :nx]
-        sums.weights.R[:] += hessian[:, nx:, nx:]
+        weights.Q[:-1] += hessian[:, :nx, :nx]
+        weights.S[:] += hessian[:, nx:, :nx]
+        weights.R[:] += hessian[:, nx:, nx:]
 
     def _vector_barriers(
         self, values: ConstraintValues, delta: float
@@ -429,7 +403,6 @@ class SubstepConstraint(Constraint):
             yield i, magnitude.barrier(observed, upper, scale, delta=delta, weight=weight)
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
 class ControlConstraint(Constraint):
     """Ranges of the controls.
 
@@ -451,11 +424,12 @@ class ControlConstraint(Constraint):
         self, values: ConstraintValues, delta: float, sums: ExpansionSums, factors: Array | None
     ) -> None:
         """See `Constraint.add_expansion`."""
-        barrier = self.barrier(values, delta, factors)
-        diagonal = np.arange(sums.b.shape[1])
+        _, slope, curvature = self.barrier(values, delta, factors)
+        _, b, weights = sums
+        diagonal = np.arange(b.shape[1])
 
-        sums.b[:] += barrier.slope
-        sums.weights.R[:, diagonal, diagonal] += barrier.curvature
+        b += slope
+        weights.R[:, diagonal, diagonal] += curvature
 
 
 @record
@@ -522,13 +496,14 @@ class ControlRateConstraint(Constraint):
         self, values: ConstraintValues, delta: float, sums: ExpansionSums, factors: Array | None
     ) -> None:
         """See `Constraint.add_expansion`."""
-        barrier = self.barrier(values, delta, factors)
-        slope = barrier.slope / self.dt
+        _, by_rate, curvature = self.barrier(values, delta, factors)
+        slope = by_rate / self.dt
 
         # A control raises the rate into its sample and lowers the rate out of it.
-        b, W = sums.b, sums.weights.W
-        b += (barrier.slope[:-1] - barrier.slope[1:]) / self.dt
-        W += barrier.curvature / self.dt**2
+        _, b, weights = sums
+        b += (by_rate[:-1] - by_rate[1:]) / self.dt
+        W = weights.W
+        W += curvature / self.dt**2
 
         # After the last sample a periodic control returns to that of the first sample.
         if self.periodic:
@@ -595,9 +570,11 @@ class EndStateConstraint(Constraint):
         self, values: ConstraintValues, delta: float, sums: ExpansionSums, factors: Array | None
     ) -> None:
         """See `Constraint.add_expansion`."""
-        barrier, J = self.barrier(values, delta, factors), self._slope(values)
-        sums.a[-1] += J.T @ barrier.slope
-        sums.weights.Q[-1] += J.T @ (barrier.curvature[:, None] * J)
+        _, slope, curvature = self.barrier(values, delta, factors)
+        J = self._slope(values)
+        a, _, weights = sums
+        a[-1] += J.T @ slope
+        weights.Q[-1] += J.T @ (curvature[:, None] * J)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -659,10 +636,11 @@ class ClearanceConstraint(Constraint):
         self, values: ConstraintValues, delta: float, sums: ExpansionSums, factors: Array | None
     ) -> None:
         """See `Constraint.add_expansion`."""
-        barrier, slopes = self.barrier(values, delta, factors), self._slopes(values)
+        _, slope, curvature = self.barrier(values, delta, factors)
+        slopes = self._slopes(values)
         nv = slopes.shape[2]
-        hessian = np.swapaxes(slopes * barrier.curvature[..., None], 1, 2) @ slopes
 
         # Distances are measured at the samples 1 ... N.
-        sums.a[1:, :nv] += np.einsum("km,kmi->ki", barrier.slope, slopes)
-        sums.weights.Q[1:, :nv, :nv] += hessian
+        a, _, weights = sums
+        a[1:, :nv] += np.einsum("km,kmi->ki", slope, slopes)
+        weights.Q[1:, :nv, :nv] += np.swapaxes(slopes * curvature[..., None], 1, 2) @ slopes

@@ -150,7 +150,8 @@ class CurvatureOfLimits(StepCurvature):
             growth = max(growth, float((new / old).max(initial=1.0)))
             found.append(new)
 
-        return self.sums(found).weights.scaled(self.mu), tuple(found), growth
+        _, _, weights = self.sums(found)
+        return weights.scaled(self.mu), tuple(found), growth
 
     def sums(self, factors: Sequence[Array] | None = None) -> ExpansionSums:
         """Gradient and Gauss-Newton Hessian of the barrier, without its weight.
@@ -158,8 +159,15 @@ class CurvatureOfLimits(StepCurvature):
         Args:
             factors: Factors of the curvature, by kind; default: 1.
         """
-        jacobian = self.values.jacobian
-        sums = ExpansionSums.zero(len(jacobian), jacobian.shape[-1] - self.nu, self.nu)
+        jacobian, nu = self.values.jacobian, self.nu
+        N, nx = len(jacobian), jacobian.shape[-1] - nu
+        weights = Weights(
+            Q=np.zeros((N + 1, nx, nx)),
+            S=np.zeros((N, nu, nx)),
+            R=np.zeros((N, nu, nu)),
+            W=np.zeros((N + 1, nu)),
+        )
+        sums = np.zeros((N + 1, nx)), np.zeros((N, nu)), weights
         for i, member in enumerate(self.members):
             each = None if factors is None else factors[i]
             member.add_expansion(self.values, self.delta, sums, each)
@@ -309,7 +317,7 @@ class ConstraintSet:
             values: The constrained quantities along a trajectory.
             delta: Relaxation of the barrier, a relative margin.
         """
-        return float(sum(member.barrier(values, delta).value for member in self.members))
+        return float(sum(member.barrier(values, delta)[0] for member in self.members))
 
     def narrowing(
         self, values: ConstraintValues, delta: float, controls: Sequence[str]
@@ -351,16 +359,16 @@ class ConstraintSet:
         values = replace(values, observation_jacobian=observation_jacobian)
 
         curvature = CurvatureOfLimits(members=self.members, values=values, delta=delta, nu=nu)
-        sums = curvature.sums()
+        a, b, weights = curvature.sums()
 
         step_scale = np.full(nu, np.inf)
         if self.rate is not None:
             step_scale = self.rate.bounds.scale * self.rate.dt
 
         return BarrierExpansion(
-            a=sums.a,
-            b=sums.b,
-            weights=sums.weights,
+            a=a,
+            b=b,
+            weights=weights,
             observations=observation_jacobian / self.substeps.column_scale[:, None],
             control_scale=self.control.bounds.scale,
             control_step_scale=step_scale,

@@ -33,7 +33,7 @@ from mjfim.excitation.task import DesignTask
 from mjfim.excitation.task_parts import named_file
 from mjfim.model.units import LENGTH
 from mjfim.model.variants import unconstrained
-from mjfim.plant.batch import BatchSimulator
+from mjfim.plant.batch import BatchSimulator, SubstepObservations
 from mjfim.records.design import LimitUsage, LimitViolation
 from mjfim.records.trajectory import Trajectory
 
@@ -212,6 +212,15 @@ def _smaller_of(first: dict[str, float], second: dict[str, float]) -> dict[str, 
     return {kind: min(margin, second[kind]) for kind, margin in first.items()}
 
 
+def _farthest(shares: Array, observations: SubstepObservations, steps: int) -> Array:
+    """(N, steps, w) the farthest position of all rows, (N, rows, w), that belong to a step."""
+    within = shares[:, :steps].copy()
+    for row, step in enumerate(observations.force_rows, start=steps):
+        farther = np.abs(shares[:, row]) > np.abs(within[:, step])
+        within[:, step] = np.where(farther, shares[:, row], within[:, step])
+    return within
+
+
 def usage_within_samples(
     task: DesignTask, constraints: ConstraintSet, observed: Array
 ) -> Iterator[LimitUsage]:
@@ -230,13 +239,7 @@ def usage_within_samples(
     N, _, count = quantities.shape
     steps = task.system.grid.substeps
     shares = substeps.bounds.relative_position(quantities)
-
-    # The position of an engine step is the farthest one of all rows that belong to it.
-    within = shares[:, :steps].copy()
-    for row, step in enumerate(constraints.observations.force_rows, start=steps):
-        farther = np.abs(shares[:, row]) > np.abs(within[:, step])
-        within[:, step] = np.where(farther, shares[:, row], within[:, step])
-    positions = within.reshape(N * steps, count)
+    positions = _farthest(shares, constraints.observations, steps).reshape(N * steps, count)
 
     t = _engine_times(task, len(positions))
     for i, (kind, name) in enumerate(zip(substeps.kinds, substeps.names, strict=True)):

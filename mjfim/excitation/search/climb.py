@@ -7,7 +7,7 @@ of its own, here or on a worker, with a number of iterations and a time.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Generator, Iterator, Mapping
+from collections.abc import Callable, Generator, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -236,24 +236,16 @@ class Grounds:
         return sum(plant.engine_steps for plant in plants.values())
 
 
-@record
-class Plan:
-    """Data that all moves of a design share, for workers."""
-
-    experiment: Experiment
-    variant: ModelVariant
-    combinations: Array | None
-    added_information: Array | None
-    threads: int
-
-    def grounds(self) -> Grounds:
-        """The levels in a worker."""
-        task = DesignTask.resolve(
-            self.experiment,
-            threads=self.threads,
-            added_information=self.added_information,
-        )
-        return Grounds(task.with_variant(self.variant), self.combinations)
+def made_grounds(
+    experiment: Experiment,
+    variant: ModelVariant,
+    combinations: Array | None,
+    added_information: Array | None,
+    threads: int,
+) -> Grounds:
+    """Make the levels of a design in a worker."""
+    task = DesignTask.resolve(experiment, threads=threads, added_information=added_information)
+    return Grounds(task.with_variant(variant), combinations)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -280,7 +272,7 @@ class Move:
     budget: Budget
     keeps_curves: bool = False
     may_continue: bool = False
-    plan: SharedValue[Plan] | None = None
+    plan: SharedValue[Callable[[], Grounds]] | None = None
 
 
 _kept = KeptPerThread[Grounds](KEPT_GROUNDS)
@@ -290,7 +282,7 @@ _kept = KeptPerThread[Grounds](KEPT_GROUNDS)
 def move_in_worker(move: Move) -> Candidate:
     """Let a candidate climb, for an executor."""
     assert move.plan is not None
-    grounds = _kept.get(move.plan.digest, move.plan.value.grounds)
+    grounds = _kept.get(move.plan.digest, move.plan.value)
     stated, of_pool = move.budget.stop, pool_stop_token()
     stop = StopToken(also=lambda: stated.requested or of_pool.requested)
     climb = Climb(grounds, replace(move, budget=move.budget.with_stop(stop))).run()
@@ -516,7 +508,7 @@ class Climb:
         following = replace(
             found, control=control, curves=curves, repeats=1, first_weight=None, is_judged=True
         )
-        values = cost.values(control)
+        values = cost.level.values(control)
         point = cost.point_along(values)
         if point is None:
             return replace(begun, history=found.history, steps=found.steps, is_judged=True)
@@ -588,7 +580,7 @@ def without_jumps(cost: LimitedCost, control: Array, factor: int) -> Array:
     """
     values = control[::factor]
     is_stepped = factor > 1 and np.array_equal(control, np.repeat(values, factor, axis=0))
-    if cost.constraints.rate is None or not is_stepped:
+    if cost.level.constraints.rate is None or not is_stepped:
         return control
 
     # The values of the longer samples hold at their middles.

@@ -18,13 +18,13 @@ from mjfim.arrays import Array, record
 from mjfim.errors import SimulationDivergedError
 from mjfim.excitation.limits.constraints import FORCE_KINDS
 from mjfim.excitation.objective import DIVERGED, DesignPoint, DesignProblem
-from mjfim.excitation.search.inside import LimitedLevel, largest_share
+from mjfim.excitation.search.inside import largest_share
 from mjfim.excitation.search.interior_problem import InteriorPoint, InteriorProblem, values_of
 from mjfim.excitation.search.levels import DescentLevel, bandwidth_basis, regulator_for
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.initial import independent_curves
 from mjfim.optimize.directions import LBFGS, MetricDescent
-from mjfim.optimize.projection_operator import Armijo, Direction, Iterate, Regulator, optimize
+from mjfim.optimize.projection_operator import Direction, Iterate, Regulator, optimize
 from mjfim.optimize.structured_bfgs import StructuredBFGS
 from mjfim.parallel.budget import Budget
 from mjfim.records.design import Status
@@ -131,15 +131,17 @@ class Step:
 
 
 @record
-class Ground(LimitedLevel):
+class Ground:
     """The level on which descents work, over one repetition of the control.
 
     Attributes:
+        level: The level, on the plant without the clamps that limits make unreachable.
         curves: (N, M) curves at the stated sample rate of which controls are sums; None where each
             sample is free.
         repeats: How often the control is played, one after the other.
     """
 
+    level: DescentLevel
     curves: Array | None = None
     repeats: int = 1
 
@@ -247,7 +249,7 @@ class Ground(LimitedLevel):
             start,
             direction,
             regulator_for(self.task),
-            _line_search(budget),
+            budget=budget,
             tolerance=tolerance,
             max_iterations=max(most - done, 0),
         )
@@ -272,10 +274,10 @@ class Ground(LimitedLevel):
         Derivatives do not exist where a clamp of the model acts. clamped: number of iterates before
         this one, one after the other, along which a clamp acts; it comes back with this one.
         """
-        values = self.values(step.iterate.point.trajectory.ctrl)
-        if values is None or not self.constraints.is_feasible(values):
+        values = self.level.values(step.iterate.point.trajectory.ctrl)
+        if values is None or not self.level.constraints.is_feasible(values):
             return replace(step, is_inside=False, has_left=True), clamped
-        margins = self.constraints.margins(values)
+        margins = self.level.constraints.margins(values)
         is_clamped = any(margins.get(kind, 1.0) <= 0.0 for kind in FORCE_KINDS)
         clamped = clamped + 1 if is_clamped else 0
         has_left = clamped > MAX_CLAMPED_ITERATES
@@ -305,8 +307,10 @@ class Ground(LimitedLevel):
 
             def keeps(share: float, centre: Array = centre) -> bool:
                 """Check whether a share of the control is strictly inside."""
-                values = self.values(centre + share * (fitted - centre))
-                return values is not None and self.constraints.is_feasible(values, strictly=True)
+                values = self.level.values(centre + share * (fitted - centre))
+                return values is not None and self.level.constraints.is_feasible(
+                    values, strictly=True
+                )
 
             share = largest_share(keeps, budget)
             if share is not None:
@@ -324,13 +328,13 @@ class Ground(LimitedLevel):
             start,
             self.direction(),
             self._regulator,
-            _line_search(budget),
+            budget=budget,
             tolerance=STEERING_TOLERANCE,
             max_iterations=STEERING_ITERATIONS,
         )
         for iterate in iterates:
             found = iterate.point
-            if self.constraints.is_feasible(values_of(found), strictly=True):
+            if self.level.constraints.is_feasible(values_of(found), strictly=True):
                 return found.ctrl
             if budget.exhausted is not None:
                 break
@@ -342,7 +346,7 @@ class Ground(LimitedLevel):
         """The problem of a stage: `log J + mu B` within limits that are moved inwards."""
         return InteriorProblem(
             base=self._smooth,
-            constraints=self.constraints.tightened(tightening),
+            constraints=self.level.constraints.tightened(tightening),
             mu=mu,
             delta=min(MAX_RELAXATION, barrier.relaxation * mu),
             with_cost=with_cost,
@@ -376,7 +380,7 @@ class Ground(LimitedLevel):
             problem.reevaluate(point),
             direction,
             self._regulator,
-            _line_search(budget),
+            budget=budget,
             tolerance=min(barrier.tolerance, Barrier.tolerance),
             max_iterations=min(max_iterations, STAGE_ITERATIONS * (1 + is_last)),
         )
@@ -404,13 +408,13 @@ class Ground(LimitedLevel):
             point=None if point is None else self.exact(point),
             control=self.at_stated_rate(iterate.point.ctrl),
             mu=mu,
-            margins=self.constraints.relative_margins(values),
-            is_inside=self.constraints.is_feasible(values),
+            margins=self.level.constraints.relative_margins(values),
+            is_inside=self.level.constraints.is_feasible(values),
         )
 
     def direction(self) -> StructuredBFGS:
         """A quasi-Newton direction under hard limits, without any curvature pairs yet."""
-        ridge = RIDGE / self.task.samples / self.constraints.control.bounds.scale**2
+        ridge = RIDGE / self.task.samples / self.level.constraints.control.bounds.scale**2
         return StructuredBFGS(ridge, self._basis)
 
     @cached_property
@@ -446,10 +450,10 @@ class Ground(LimitedLevel):
 
         The end of a motion depends on all of it, and gets inside without help.
         """
-        values = self.values(control)
+        values = self.level.values(control)
         if values is None:
             return False
-        margins = self.constraints.relative_margins(values)
+        margins = self.level.constraints.relative_margins(values)
         inner = [margin for kind, margin in margins.items() if not kind.startswith("end_")]
         return min(inner, default=0.0) > -MAX_START_VIOLATION
 
@@ -485,11 +489,6 @@ def _direction_for(level: DescentLevel) -> tuple[Direction, DesignProblem]:
     extended_Q = np.diag(np.concatenate([np.diag(Q), psi_weights]))
     direction = MetricDescent(extended_Q, R, extended_Q, weighs_psi=True)
     return direction, replace(level.problem, extends=True)
-
-
-def _line_search(budget: Budget) -> Armijo:
-    """A line search that ends with its time."""
-    return Armijo(is_over=lambda: budget.exhausted is not None)
 
 
 def _meet(level: DescentLevel, eigenvalues: Array, ratio: float) -> bool:

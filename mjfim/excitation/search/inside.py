@@ -20,7 +20,6 @@ from mjfim.arrays import Array, record
 from mjfim.errors import SimulationDivergedError
 from mjfim.excitation.evaluation import UNSTABLE_GROWTH, growth_along
 from mjfim.excitation.limits.constraint_kinds import ConstraintValues, EndStateConstraint
-from mjfim.excitation.limits.constraints import ConstraintSet, constraint_set_of
 from mjfim.excitation.limits.verification import verify
 from mjfim.excitation.objective import DesignPoint
 from mjfim.excitation.search.levels import DescentLevel, bandwidth_basis, moved_alike
@@ -66,48 +65,29 @@ LEAST_PROGRESS = 0.01
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class LimitedLevel:
-    """A level with its limits.
-
-    Attributes:
-        level: The level, on the plant without the clamps that limits make unreachable.
-    """
-
-    level: DescentLevel
-
-    @cached_property
-    def constraints(self) -> ConstraintSet:
-        """The limits."""
-        return constraint_set_of(self.level.task)
-
-    def values(self, control: Array) -> ConstraintValues | None:
-        """Limited quantities along a control: (N, nu); None where the simulation diverges."""
-        task = self.level.task
-        return self.constraints.along(task.plant, task.theta, control)
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class LimitedCost(LimitedLevel):
+class LimitedCost:
     """Cost of controls that keep all limits on the stated level.
 
     Attributes:
+        level: The level, on the plant without the clamps that limits make unreachable.
         first: The initial control, evaluated on the unmodified plant; None where it is not known.
     """
 
+    level: DescentLevel
     first: DesignPoint | None = None
 
     def nearly_keeps(self, control: Array) -> bool:
         """Check the limits on the plant of the search only, which is much quicker."""
-        values = self.values(control)
-        return values is not None and self.constraints.is_feasible(values)
+        values = self.level.values(control)
+        return values is not None and self.level.constraints.is_feasible(values)
 
     def keeps(self, control: Array) -> bool:
         """Check the limits on the unmodified model as well."""
-        return self.keeps_along(self.values(control))
+        return self.keeps_along(self.level.values(control))
 
     def keeps_along(self, values: ConstraintValues | None) -> bool:
         """Check the limits along a motion, also on the unmodified model."""
-        if values is None or not self.constraints.is_feasible(values):
+        if values is None or not self.level.constraints.is_feasible(values):
             return False
         return verify(self.level.task, values.trajectory).is_feasible
 
@@ -121,7 +101,7 @@ class LimitedCost(LimitedLevel):
 
     def inside(self, control: Array) -> DesignPoint | None:
         """Evaluate a control: (N, nu); None where it violates a limit."""
-        values = self.values(control)
+        values = self.level.values(control)
         return self.point_along(values) if self.keeps_along(values) else None
 
 
@@ -256,9 +236,7 @@ class InsideSearch:
             patience: Number of changes without clear progress after which the search ends.
         """
         while self._untried and budget.exhausted is None:
-            bandwidth = self._untried.popleft()
-            proposed = self._proposed(best, bandwidth, budget)
-            found = self._repeatable(proposed, best)
+            found = self._repeatable(self._proposed(best, self._untried.popleft(), budget), best)
             if found is not None:
                 best = found
                 yield best
@@ -268,8 +246,10 @@ class InsideSearch:
         while without_progress < patience and budget.exhausted is None:
             # Bandwidths that have led to improvements are tried more often.
             choice = int(self._rng.choice(len(BANDWIDTHS), p=successes / successes.sum()))
-            changed = self._changed(best, BANDWIDTHS[choice], size)
-            found = self._repeatable(self.largest(best.about, changed, budget), best)
+            found = self._repeatable(
+                self.largest(best.about, self._changed(best, BANDWIDTHS[choice], size), budget),
+                best,
+            )
             if found is None:
                 size = max(size * AFTER_FAILURE, SMALLEST_SIZE)
                 without_progress += 1
@@ -389,7 +369,7 @@ class InsideSearch:
     @property
     def _widths(self) -> Array:
         """(nu,) half of the ranges of the controls [u-unit]."""
-        return self.cost.constraints.control.bounds.scale
+        return self.cost.level.constraints.control.bounds.scale
 
 
 # Singular values of the reachable ends, relative to the largest one, below which they count as
@@ -415,7 +395,7 @@ def _end_correction(cost: LimitedCost, values: ConstraintValues) -> Array | None
         that has a tolerance [x-unit]. None with a free end, and where the motion diverges or is so
         unstable that its derivatives overflow.
     """
-    constraints, task = cost.constraints, cost.level.task
+    constraints, task = cost.level.constraints, cost.level.task
     if constraints.end is None:
         return None
     try:
@@ -469,20 +449,20 @@ def with_corrected_end(cost: LimitedCost, control: Array, budget: Budget) -> Ins
         The control; None where the motion does not miss its target, or no share helps.
     """
     centre = cost.level.task.centre
-    end, change = cost.constraints.end, None
+    end, change = cost.level.constraints.end, None
     for share in CORRECTION_SHARES:
         candidate = np.asarray(centre + share * (control - centre))
         for corrections_left in reversed(range(1 + CORRECTIONS)):
-            values = cost.values(candidate)
+            values = cost.level.values(candidate)
             if values is None or budget.stop.requested:
                 break
-            if cost.constraints.is_feasible(values):
+            if cost.level.constraints.is_feasible(values):
                 point = cost.point_along(values) if cost.keeps_along(values) else None
                 if point is not None and np.isfinite(point.cost):
                     deviation = candidate - centre
                     return InsideControl(about=centre, deviation=deviation, point=point)
                 break
-            margins = cost.constraints.margins(values)
+            margins = cost.level.constraints.margins(values)
             misses = any(each < 0.0 for kind, each in margins.items() if kind.startswith("end_"))
             if not (misses and corrections_left):
                 break

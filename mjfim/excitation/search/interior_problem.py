@@ -189,6 +189,22 @@ class InteriorProblem:
         weight = self.mu if self.with_cost else 1.0
         return max(1.0, abs(point.barrier) * weight)
 
+    def _expansion_of_cost(
+        self, point: InteriorPoint, values: ConstraintValues
+    ) -> tuple[Expansion, Array]:
+        """Expansion of `log J`, and derivatives of the observations by state and control."""
+        observations = self.constraints.observations
+        if point.point is not None:
+            expansion, observed = self.base.expand_observed(point.point, observations)
+            assert observed is not None
+            return expansion, observed
+        # Without a cost only the dynamics and the observations are linearised.
+        A, B, jacobian = self.base.plant.derivatives.observation_jacobians(
+            self.base.theta, values.trajectory, observations
+        )
+        a, b = np.zeros((len(A) + 1, A.shape[1])), np.zeros((len(A), B.shape[2]))
+        return Expansion(A=A, B=B, a=a, b=b), jacobian
+
     def expand(self, point: InteriorPoint) -> Expansion:
         """Expand `log J + mu B` about a point; the expansion of `mu B` is also given separately.
 
@@ -200,19 +216,7 @@ class InteriorProblem:
         """
         values = values_of(point)
         values = self.constraints.evaluate(values.trajectory, values.observed, slopes=True)
-        theta, observations = self.base.theta, self.constraints.observations
-        if point.point is not None:
-            expansion, observed = self.base.expand_observed(point.point, observations)
-            assert observed is not None
-            jacobian = observed
-        else:
-            # Without a cost only the dynamics and the observations are linearised.
-            A, B, jacobian = self.base.plant.derivatives.observation_jacobians(
-                theta, values.trajectory, observations
-            )
-            a, b = np.zeros((len(A) + 1, A.shape[1])), np.zeros((len(A), B.shape[2]))
-            expansion = Expansion(A=A, B=B, a=a, b=b)
-
+        expansion, jacobian = self._expansion_of_cost(point, values)
         scale = self._merit_scale(point)
         barrier = self.constraints.expand(values, jacobian, self.delta)
         barrier = barrier.scaled(self.mu)

@@ -10,6 +10,8 @@ import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.errors import ExperimentError, SimulationDivergedError
+from mjfim.excitation.limits.constraint_kinds import ConstraintValues
+from mjfim.excitation.limits.constraints import ConstraintSet, constraint_set_of
 from mjfim.excitation.objective import DesignPoint, DesignProblem
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.initial import spline_basis
@@ -111,6 +113,15 @@ class DescentLevel:
             forward_differences_only=has_long_samples,
             lumped=self._lumped,
         )
+
+    @cached_property
+    def constraints(self) -> ConstraintSet:
+        """The limits."""
+        return constraint_set_of(self.task)
+
+    def values(self, control: Array) -> ConstraintValues | None:
+        """Limited quantities along a control: (N, nu); None where the simulation diverges."""
+        return self.constraints.along(self.task.plant, self.task.theta, control)
 
     @property
     def engine_steps(self) -> int:

@@ -10,9 +10,9 @@ descents run side by side. Each is one task or several, which may be lost withou
 from __future__ import annotations
 
 import uuid
-from collections.abc import Generator, Iterable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import islice
 
 import numpy as np
@@ -24,9 +24,9 @@ from mjfim.excitation.search.climb import (
     Grounds,
     Move,
     Moved,
-    Plan,
     Rung,
     Rungs,
+    made_grounds,
     move_in_worker,
     row_of,
 )
@@ -372,15 +372,18 @@ class Search:
         barrier = rung.barrier
         if barrier is None or len(rows) < 2 or np.isinf(self.budget.seconds_left):
             return rung
-        ratio = self.grounds.stated.engine_steps / level.engine_steps
-        each = ratio * (rows[-1].seconds - rows[0].seconds) / (len(rows) - 1)
+        each = (
+            self.grounds.stated.engine_steps
+            / level.engine_steps
+            * (rows[-1].seconds - rows[0].seconds)
+            / (len(rows) - 1)
+        )
         iterations = self.budget.seconds_left / len(batch) / max(each, 1e-9)
         stages = max(int(iterations / ITERATIONS_OF_A_STAGE), 1)
         if stages >= len(barrier.weights):
             return rung
-        last = barrier.first / MU_FACTOR ** (stages - 1)
-        short = replace(barrier, last=max(last, barrier.last), relaxation=Barrier.relaxation)
-        return replace(rung, barrier=short)
+        last = max(barrier.first / MU_FACTOR ** (stages - 1), barrier.last)
+        return replace(rung, barrier=replace(barrier, last=last, relaxation=Barrier.relaxation))
 
     # ---- random changes
 
@@ -436,9 +439,11 @@ class Search:
         for found in self.inside.improvements(inside, budget, PATIENCE):
             inside = found
             candidate = candidate.improved(found.control, found.point)
-            values = self.grounds.cost.values(found.control)
+            values = self.grounds.cost.level.values(found.control)
             margins = (
-                {} if values is None else self.grounds.cost.constraints.relative_margins(values)
+                {}
+                if values is None
+                else self.grounds.cost.level.constraints.relative_margins(values)
             )
             row = row_of(
                 found.point,
@@ -685,22 +690,23 @@ class Search:
             found = replace(judged, status=found.status)
         return _named_stop(found, self.budget)
 
-    def _plan(self, threads: int) -> SharedValue[Plan]:
-        """The plan that all moves share."""
+    def _plan(self, threads: int) -> SharedValue[Callable[[], Grounds]]:
+        """How a worker with some threads makes the levels, which all moves share."""
         if threads not in self._plans:
             task = self.grounds.stated.task
-            plan = Plan(
-                experiment=for_workers(task.experiment, task.system.source),
-                variant=task.system.variant,
-                combinations=self.stage.basis,
-                added_information=task.added_information,
-                threads=threads,
+            plan = partial(
+                made_grounds,
+                for_workers(task.experiment, task.system.source),
+                task.system.variant,
+                self.stage.basis,
+                task.added_information,
+                threads,
             )
             self._plans[threads] = SharedValue(uuid.uuid4().hex, plan)
         return self._plans[threads]
 
     @cached_property
-    def _plans(self) -> dict[int, SharedValue[Plan]]:
+    def _plans(self) -> dict[int, SharedValue[Callable[[], Grounds]]]:
         """Plans by the threads of each move."""
         return {}
 

@@ -28,7 +28,7 @@ from mjfim.identification.assessment.robust_covariance import (
     robust_uncertainty,
 )
 from mjfim.identification.fit_problem import FitProblem
-from mjfim.identification.linear_coordinates import CadPrior
+from mjfim.identification.linear_coordinates import cad_bodies, cad_information, columns_of
 from mjfim.identification.search import FitTask, of_subset
 from mjfim.information.criteria import marginal, standard_deviations
 from mjfim.information.null_space import NullSpace, parameter_groups
@@ -60,20 +60,19 @@ def inertia_combinations(
         [theta-unit]. None without a CAD prior.
     """
     is_shared = ~parameters.recording_specific
-    prior = CadPrior.of(parameters).of_bodies(is_shared)
-    columns = prior.columns
+    bodies = [body for body in cad_bodies(parameters) if is_shared[body.columns].all()]
+    columns = columns_of(bodies)
     if not len(columns):
         return None
 
     # Other parameters are estimated as well, so that their uncertainty counts.
-    others = np.setdiff1d(np.flatnonzero(is_shared), columns)
-    kept = np.concatenate([columns, others])
-    stated = parameters.prior_information[np.ix_(kept, kept)]
-    about = marginal(data[np.ix_(kept, kept)], stated, np.arange(len(columns)))
+    kept = np.concatenate([columns, np.setdiff1d(np.flatnonzero(is_shared), columns)])
+    both = np.ix_(kept, kept)
+    about = marginal(data[both], parameters.prior_information[both], np.arange(len(columns)))
 
     # Eigenvalues of the information relative to the prior do not depend on the coordinates.
-    information = prior.information(theta)[np.ix_(columns, columns)]
-    known, scale = scaled_to_unit_diagonal(information)
+    own = np.ix_(columns, columns)
+    known, scale = scaled_to_unit_diagonal(cad_information(bodies, theta)[own])
     ratios, vectors = scipy.linalg.eigh(about / np.outer(scale, scale), known)
     left = 1.0 / np.sqrt(1.0 + np.maximum(ratios, 0.0))
     return columns, left <= DETERMINED_SHARE, vectors / scale[:, None]
@@ -325,7 +324,7 @@ def _poorly_known(
     sizes = np.maximum(parameters.sizes(theta), SMALLEST_RELATIVE_SIZE * parameters.magnitude)
     half_widths = 0.5 * (interval[:, 1] - interval[:, 0])
     shares = np.where(np.isfinite(half_widths), half_widths / sizes, 0.0)
-    chosen = np.setdiff1d(parameters.interest, CadPrior.of(parameters).columns)
+    chosen = np.setdiff1d(parameters.interest, columns_of(cad_bodies(parameters)))
     chosen = chosen[shares[chosen] > POORLY_KNOWN_SHARE]
     at_guess = std_at_start(fit) if (shares[chosen] >= UNDETERMINED_SHARE).any() else std
 

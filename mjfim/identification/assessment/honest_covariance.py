@@ -233,8 +233,7 @@ def agreeing_covariance(covariance: Array, std: Array) -> Array:
         _stretch(root, j, max(std[j] / np.linalg.norm(root[j]), 1.0))
 
     # Parameters about which the covariance says nothing are uncorrelated.
-    alone = np.where(is_wanted & ~is_moving, std, 0.0)
-    return root @ root.T + np.diag(alone**2)
+    return root @ root.T + np.diag(np.where(is_wanted & ~is_moving, std, 0.0) ** 2)
 
 
 def _stretch(root: Array, j: int, factor: float) -> None:

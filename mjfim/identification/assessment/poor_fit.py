@@ -163,6 +163,6 @@ def amplifications(A: Array, sizes: Array) -> Array:
         pairs = len(products) // 2
         if not pairs:
             return np.array(found)
-        first, second = slice(0, 2 * pairs, 2), slice(1, 2 * pairs, 2)
-        products = products[second] @ products[first]
-        logarithms = logarithms[first] + logarithms[second]
+        products, logarithms = products[: 2 * pairs], logarithms[: 2 * pairs]
+        products = products[1::2] @ products[::2]
+        logarithms = logarithms[::2] + logarithms[1::2]

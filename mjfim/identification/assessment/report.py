@@ -29,9 +29,10 @@ from mjfim.identification.assessment.term_tests import TermTests, find_missing_t
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.inverse_dynamics import residual_forces
 from mjfim.identification.left_out import predict_unfitted
-from mjfim.identification.linear_coordinates import CadPrior
+from mjfim.identification.linear_coordinates import cad_bodies, cad_information
 from mjfim.identification.search import values_of_start
 from mjfim.model.parameters import ParameterSet
+from mjfim.optimize.levenberg_marquardt import UnknownValues
 from mjfim.parallel.budget import Budget
 from mjfim.plant.outputs import Noise
 from mjfim.recordings.checks import plausibility_remarks
@@ -175,7 +176,7 @@ def estimate_from(
     estimate = Estimate(
         parameters=parameters.names,
         units=system.units,
-        prior=parameters.prior_information + CadPrior.of(parameters).information(result.theta),
+        prior=parameters.prior_information + cad_information(cad_bodies(parameters), result.theta),
         theta=result.theta,
         std=accuracy.std,
         covariance=accuracy.covariance,
@@ -266,6 +267,15 @@ def _residual_forces(result: FitResult) -> tuple[ResidualForce, ...]:
         return ()
 
 
+def _nearly_unphysical(problem: FitProblem, at: UnknownValues) -> np.ndarray:
+    """Parameters near a bound at which an inertia is no longer that of a body."""
+    lower, upper = problem.bounds_at(at)
+    values = problem.common_values(at)
+    near = np.minimum(values - lower, upper - values) < PHYSICAL_TOLERANCE * np.abs(values)
+    near &= (lower > problem.lower) | (upper < problem.upper)
+    return np.asarray(problem.parameter_of_column[near])
+
+
 def _at_bounds(result: FitResult) -> tuple[tuple[str, ...], bool]:
     """Names of the parameters at a bound or beyond it, and whether any is beyond.
 
@@ -276,12 +286,7 @@ def _at_bounds(result: FitResult) -> tuple[tuple[str, ...], bool]:
     tolerance = BOUND_TOLERANCE * parameters.magnitude
     distance = np.minimum(theta - parameters.lower, parameters.upper - theta)
     is_beyond = bool((distance < -tolerance).any())
-    problem, at = result.problem, result.solution.unknowns
-    lower, upper = problem.bounds_at(at)
-    values = problem.common_values(at)
-    near = np.minimum(values - lower, upper - values) < PHYSICAL_TOLERANCE * np.abs(values)
-    near &= (lower > problem.lower) | (upper < problem.upper)
-    distance[problem.parameter_of_column[near]] = 0.0
+    distance[_nearly_unphysical(result.problem, result.solution.unknowns)] = 0.0
     at_bound = np.flatnonzero(distance < tolerance)
     names = tuple(parameters.names[j] for j in at_bound if parameters.names[j] not in held)
     return names, is_beyond
@@ -403,7 +408,7 @@ def _limits_of_search(
     result: FitResult, at_bound: Sequence[str], reasons: Sequence[str], *, interrupted: bool
 ) -> Iterator[str]:
     """Warnings about the start, the end, and what the recordings do not determine."""
-    yield from map(str, result.task.elsewhere)
+    yield from (sentence for sentence, _ in result.task.elsewhere)
     if result.begun_instead:
         yield (
             f"the model diverges at the start ({values_of_start(result.task)}): the search began "
@@ -469,8 +474,8 @@ def _implausible_estimates(parameters: ParameterSet, theta: Array) -> Iterator[s
     # The prior of an inertia is normal in ten directions, so that its distance is compared with the
     # quantile of as rare an event.
     rare = 2.0 * scipy.special.ndtr(-IMPLAUSIBLE_PRIOR_DISTANCE)
-    for body in CadPrior.of(parameters).bodies:
-        residual = body.difference(theta[body.columns]).residual / body.prior_sigma
+    for body in cad_bodies(parameters):
+        residual = body.difference(theta[body.columns])[0] / body.prior_sigma
         distance = float(np.linalg.norm(residual))
         if distance > np.sqrt(scipy.special.chdtri(len(residual), rare)):
             group = parameters.parameters[int(body.columns[0])].group

@@ -136,6 +136,19 @@ def are_white(tests: Sequence[Whiteness]) -> bool:
     return is_enough and not autocorrelated(tests)
 
 
+def _autocorrelations_in_words(found: Sequence[Whiteness]) -> str:
+    """How the residuals of some outputs are autocorrelated."""
+    # Where neighbouring values hardly correlate, means over long runs describe it.
+    listed = []
+    for test in found[:MAX_LISTED_OUTPUTS]:
+        words = f"long-run variance is {max(test.inflation, 1.0):.1f} times that of white noise"
+        if abs(test.correlation) > RELEVANT_CORRELATION:
+            words = f"lag-1 correlation {test.correlation:+.2f}"
+        listed.append(f"{test.output} ({words})")
+    more = len(found) - len(listed)
+    return ", ".join(listed) + (f" and {more} more" if more else "")
+
+
 def misfit_reasons(
     chi2: float,
     dof: int,
@@ -169,16 +182,7 @@ def misfit_reasons(
         reasons.append(f"residuals are {size:.2f} times the stated noise")
 
     if found:
-        # Where neighbouring values hardly correlate, means over long runs describe it.
-        listed = []
-        for test in found[:MAX_LISTED_OUTPUTS]:
-            words = f"long-run variance is {max(test.inflation, 1.0):.1f} times that of white noise"
-            if abs(test.correlation) > RELEVANT_CORRELATION:
-                words = f"lag-1 correlation {test.correlation:+.2f}"
-            listed.append(f"{test.output} ({words})")
-        more = len(found) - len(listed)
-        suffix = f" and {more} more" if more else ""
-        reasons.append(f"residuals are autocorrelated: {', '.join(listed)}{suffix}")
+        reasons.append(f"residuals are autocorrelated: {_autocorrelations_in_words(found)}")
     elif missing:
         reasons.append("a term that the model lacks explains part of the residuals")
     return tuple(reasons)

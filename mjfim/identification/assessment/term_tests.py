@@ -654,6 +654,25 @@ class _TermSearch:
             source=members[0].source,
         )
 
+    def _best_value(
+        self, wider: FitProblem, begin: UnknownValues, first: float
+    ) -> tuple[float, float]:
+        """Value of the parameter `?` with the least sum of squares, and this sum.
+
+        Values grow from a first one; the best is 0 where none of them is better than none.
+        """
+        place = wider.parameters.names.index("?")
+        best, least = 0.0, self.squares
+        for k in range(MAX_VALUES):
+            theta = np.array(begin.theta)
+            theta[place] = first * VALUE_FACTOR**k
+            cost = 2.0 * wider.cost(replace(begin, theta=theta))
+            if cost < least:
+                best, least = float(theta[place]), cost
+            elif best > 0.0:
+                break
+        return best, least
+
     def screened(self, candidate: Candidate) -> Term | None:
         """A term with its best value; None where no value is better than none."""
         (tested,) = candidate.tested
@@ -662,17 +681,7 @@ class _TermSearch:
         )
         if extended is None:
             return None
-        wider, begin = extended
-        place = wider.parameters.names.index("?")
-        best, least = 0.0, self.squares
-        for k in range(MAX_VALUES):
-            theta = np.array(begin.theta)
-            theta[place] = tested.begin * VALUE_FACTOR**k
-            cost = 2.0 * wider.cost(replace(begin, theta=theta))
-            if cost < least:
-                best, least = float(theta[place]), cost
-            elif best > 0.0:
-                break
+        best, least = self._best_value(*extended, tested.begin)
         reduction = self.squares - least
         if reduction < max(MIN_REDUCTION, MIN_EXPLAINED_SHARE * self.squares):
             return None

@@ -26,11 +26,12 @@ from mjfim.identification.inverse_dynamics.motion import (
     measured_forces,
     measured_motion,
 )
-from mjfim.identification.segments import bristles_of
+from mjfim.identification.segments import bristle_deflection, bristles_of
 from mjfim.model.control_laws import ControlLaws
 from mjfim.model.coordinates import dof_names
 from mjfim.model.elements import translations
 from mjfim.model.targets import ModelField
+from mjfim.model.units import actuator_gear
 from mjfim.model.variants import RELAXED, Relaxation
 from mjfim.plant.equation_of_motion import EquationOfMotion, EquationTerms, MotionPoints
 from mjfim.plant.equation_of_motion import activations as simulated_activations
@@ -67,20 +68,9 @@ SLOW_SHARES = (0.1, 0.3, 1.0)
 FEWEST_WINDOWS = 0.2
 
 
-@record
-class Equation:
-    """One of the equations.
-
-    Attributes:
-        name: Name of the degree of freedom, or of the law.
-        unit: Unit of its forces; empty for laws.
-        place: Degree of freedom, or index of the measured force whose law it is.
-    """
-
-    name: str
-    unit: str
-    place: int
-
+# Name of a degree of freedom, or of a law; unit of its forces, empty for laws; and the degree of
+# freedom, or the index of the measured force whose law it is.
+Equation = tuple[str, str, int]
 
 # Averages of a series of n points: their (k, n) weights, the (k,) middles of their windows [s], and
 # the length of a window [s].
@@ -165,11 +155,11 @@ class MotionEquations:
         fastest = np.max([np.abs(motion.qvel).max(axis=0) for motion in motions], axis=0)
         units = np.where(translations(system.model), "N", "N m").tolist()
         of_dofs = [
-            Equation(name=name, unit=unit, place=dof)
+            (name, unit, dof)
             for dof, (name, unit) in enumerate(zip(dof_names(system.model), units, strict=True))
         ]
         of_laws = [
-            Equation(name=f"law of {force.name}", unit="", place=place)
+            (f"law of {force.name}", "", place)
             for place, force in enumerate(forces)
             if force.is_modelled
         ]
@@ -205,10 +195,10 @@ class MotionEquations:
         acts = self._activations(models, motion)
         delays = thetas @ self.system.parameters.delay_derivative
         return [
-            MotionPoints(
-                states=np.concatenate([motion.qpos, motion.qvel, act], axis=1),
-                acceleration=motion.qacc,
-                ctrl=self._stated(motion.control(delay)),
+            (
+                np.concatenate([motion.qpos, motion.qvel, act], axis=1),
+                motion.qacc,
+                self._stated(motion.control(delay)),
             )
             for act, delay in zip(acts, delays.tolist(), strict=True)
         ]
@@ -244,10 +234,10 @@ class MotionEquations:
         for k, model in enumerate(models):
             columns = simulated[0 if are_alike else k].T
             act = np.stack([np.interp(motion.t, samples, column) for column in columns], axis=1)
-            for bristle in bristles_of(model):
-                speed = bristle.speed(model, motion.qvel)
-                direction = np.sign(speed) * np.abs(directions[:, bristle.dof])
-                act[:, bristle.address] = bristle.deflection(model, speed, direction)
+            for actuator, address, dof in bristles_of(model):
+                speed = actuator_gear(model, actuator) * motion.qvel[:, dof]
+                direction = np.sign(speed) * np.abs(directions[:, dof])
+                act[:, address] = bristle_deflection(model, actuator, speed, direction)
             found.append(act)
         return found
 
@@ -256,7 +246,7 @@ class MotionEquations:
         """(nv,) True for degrees of freedom on which dry friction may act."""
         model: Any = self.system.model
         found = np.asarray((model.dof_frictionloss > 0.0) | self.assumes_friction)
-        found[[bristle.dof for bristle in bristles_of(model)]] = True
+        found[[dof for _, _, dof in bristles_of(model)]] = True
         for parameter in self.system.parameters.parameters:
             for target in parameter.targets:
                 field = target.field
@@ -331,9 +321,8 @@ class MotionEquations:
         measured, modelled = self.forces_along(each, terms)
         parts = []
         nothing = np.zeros(len(measured))
-        for equation, (weights, _, _) in zip(self.equations, each.windows, strict=True):
-            place = equation.place
-            if equation.unit:
+        for (_, unit, place), (weights, _, _) in zip(self.equations, each.windows, strict=True):
+            if unit:
                 series = [terms.needed[:, place], measured[:, place], terms.inertial[:, place]]
             else:
                 series = [modelled[:, place], each.forces[:, place], nothing]
@@ -373,9 +362,8 @@ def _recorded(
     slow = (np.abs(motion.qvel) < of.friction_speeds) & of.has_friction
 
     windows = []
-    for equation in of.equations:
-        place = equation.place
-        if equation.unit:
+    for _, unit, place in of.equations:
+        if unit:
             found = _windows(motion, spacing[place], usable[:, place], slow[:, place])
         else:
             known = near[:, place] & motion.usable[:, touched[place]].all(axis=1)

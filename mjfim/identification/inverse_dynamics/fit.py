@@ -28,8 +28,8 @@ from mjfim.identification.aligned_recording import AlignedRecording, align, on_g
 from mjfim.identification.assessment.residual_tests import whiteness_of
 from mjfim.identification.inverse_dynamics.equations import MotionEquations, residual_forces
 from mjfim.identification.inverse_dynamics.motion import measured_forces
-from mjfim.identification.linear_coordinates import CadPrior, LinearCoordinates
-from mjfim.model.control_laws import LawField
+from mjfim.identification.linear_coordinates import LinearCoordinates, cad_rows, columns_of
+from mjfim.model.control_laws import is_law_number
 from mjfim.model.elements import model_length, translations
 from mjfim.model.parameters import ParameterSet
 from mjfim.optimize.condensed_least_squares import bounded_least_squares, triangle
@@ -169,7 +169,7 @@ class EquationSearch:
         contained = parameters.changes_model | (parameters.delay_derivative != 0.0)
         contained &= ~np.isin(parameters.names, system.experiment.fit.hold)
         contained &= [
-            not all(isinstance(target.field, LawField) for target in parameter.targets)
+            not all(is_law_number(target.field) for target in parameter.targets)
             or not parameter.targets
             for parameter in parameters.parameters
         ]
@@ -216,14 +216,13 @@ class EquationSearch:
             yield np.clip(moved, self.parameters.lower, self.parameters.upper), True
 
         # Other values of the parameters that are no inertias of whole bodies.
-        plain = np.isin(np.arange(len(self.start)), self.active)
-        for body in self.coordinates.bodies:
-            plain[body.columns] = False
+        of_bodies = columns_of(self.coordinates.bodies)
+        plain = np.setdiff1d(self.active, of_bodies)
         rng = np.random.default_rng(0)
         points = sum(len(each.motion.t) for each in self.equations.recorded)
         evaluations = points * (len(self.active) + 1) * USUAL_LINEARISATIONS
         for _ in range(int(min(OTHER_STARTS, MOST_EVALUATIONS / evaluations))):
-            factor = LARGEST_FACTOR ** rng.uniform(-1.0, 1.0, int(plain.sum()))
+            factor = LARGEST_FACTOR ** rng.uniform(-1.0, 1.0, len(plain))
             start = np.array(self.start)
             start[plain] *= factor
             yield np.clip(start, self.parameters.lower, self.parameters.upper), False
@@ -351,9 +350,9 @@ class EquationSearch:
 
     def _weak_priors(self, x: Array) -> tuple[Array, Array]:
         """Weak priors about the model's inertias and about the start."""
-        prior = CadPrior(bodies=self.coordinates.bodies, count=len(x))
-        of_bodies = prior.rows(x, linear=True)
-        held = np.setdiff1d(self.active, prior.columns)
+        bodies = self.coordinates.bodies
+        of_bodies = cad_rows(bodies, x, linear=True)
+        held = np.setdiff1d(self.active, columns_of(bodies))
         weight = 1.0 / (HOLD_SIGMA * self.coordinates.sizes[held])
         return (
             np.concatenate([of_bodies[:, -1], weight * (x - self.start)[held]]),
@@ -494,8 +493,8 @@ def _force_sizes(system: System, rows: Array, equations: MotionEquations) -> Arr
 
     # The law of an actuator is compared with its own force.
     sizes = np.where(measured > 0.0, measured, needed)
-    dofs = np.array([each.place for each in equations.equations])
-    is_dof = np.array([bool(each.unit) for each in equations.equations])
+    dofs = np.array([place for _, _, place in equations.equations])
+    is_dof = np.array([bool(unit) for _, unit, _ in equations.equations])
     of_dofs = measured if measured[is_dof].any() else needed
     largest = float((of_dofs[is_dof] / arms[dofs[is_dof]]).max(initial=0.0))
     sizes[is_dof] = largest * arms[dofs[is_dof]]
@@ -621,7 +620,7 @@ def _record(search: EquationSearch, found: FoundEquations) -> InverseDynamicsFit
     parameters = search.parameters
     fits = tuple(_equation_fits(search, found))
     times = {fit.name: fit.correlation for fit in fits}
-    correlation = np.array([times.get(each.name, 1.0) for each in search.equations.equations])
+    correlation = np.array([times.get(name, 1.0) for name, _, _ in search.equations.equations])
     covariance, unknown, determined, condition = search.accuracy(found, correlation)
 
     std = np.sqrt(np.maximum(np.diag(covariance), 0.0))
@@ -659,20 +658,20 @@ def _equation_fits(search: EquationSearch, found: FoundEquations) -> Iterator[Eq
     recording = equations.places[0]
     values = _residual(rows), rows[1], rows[2]
     residuals, measured, inertial = (np.sqrt(equations.mean_squares(each)) for each in values)
-    for i, equation in enumerate(equations.equations):
+    for i, (name, unit, _) in enumerate(equations.equations):
         own = np.flatnonzero(search.of_row == i)
         if not len(own):
             continue
         residual = _residual(rows)[own] * found.weights[own]
         parts = [residual[recording[own] == k] for k in np.unique(recording[own])]
         yield EquationFit(
-            name=equation.name,
-            unit=equation.unit,
+            name=name,
+            unit=unit,
             residual=float(residuals[i]),
             size=float(max(measured[i], inertial[i])),
             rows=len(own),
             cutoff=1.0 / max(each.windows[i][2] for each in equations.recorded),
             sigma=float(found.sigma[i]),
-            correlation=max(whiteness_of(equation.name, parts).time, 1.0),
+            correlation=max(whiteness_of(name, parts).time, 1.0),
             force=float(measured[i]),
         )

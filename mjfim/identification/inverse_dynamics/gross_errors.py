@@ -313,8 +313,10 @@ class _Search:
         forces = np.array([equations.equation.directions(qvel), qvel, np.ones_like(qvel)])
         unit = np.eye(qvel.shape[1])
         free = [
-            np.kron(unit[equation.place], weights @ forces[:, :, equation.place].T)
-            for equation, (weights, _, _) in zip(equations.equations, each.windows, strict=True)
+            np.kron(unit[place], weights @ forces[:, :, place].T)
+            for (_, _, place), (weights, _, _) in zip(
+                equations.equations, each.windows, strict=True
+            )
         ]
         return equations.rows(theta[None])[0], np.concatenate(free)
 

@@ -396,7 +396,6 @@ class JointElasticity(Term):
         element.damping = with_first(element.damping, self.value("damping"))
 
 
-@record
 class Backlash(JointElasticity):
     """A gap between the motor and the link of a joint, with stiff flanks.
 

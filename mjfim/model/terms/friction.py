@@ -228,7 +228,6 @@ class _PassiveDevice(Term):
             spec.joint(self.joint).frictionloss = 0.0
 
 
-@record
 class Stribeck(_PassiveDevice):
     """Friction that falls from its static to its Coulomb value with the speed."""
 
@@ -263,7 +262,6 @@ class Stribeck(_PassiveDevice):
         return fields, (("dynprm[5]", rounded(stiffness)),)
 
 
-@record
 class LuGre(_PassiveDevice):
     """Dynamic friction with a displacement before sliding, in place of the joint's dry friction.
 
@@ -328,7 +326,6 @@ class LuGre(_PassiveDevice):
         return fields, ()
 
 
-@record
 class AsymmetricFriction(_PassiveDevice):
     """A constant force beside the joint's dry friction, which then differs by direction."""
 

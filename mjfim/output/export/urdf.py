@@ -27,7 +27,7 @@ from mjfim.model.inertia import (
     to_barycentric,
 )
 from mjfim.model.loading import refused
-from mjfim.model.model_files import UrdfSource, urdf_sources
+from mjfim.model.model_files import urdf_sources
 from mjfim.model.parameters import Parameter
 from mjfim.model.paths import INERTIAL_FIELDS, ParameterPath
 from mjfim.model.targets import (
@@ -79,7 +79,7 @@ def urdf_files(path: Path, model: Path) -> tuple[str, ...]:
     sources = urdf_sources(model)
     if len(sources) == 1:
         return (f"{path.stem}.urdf",)
-    return tuple(f"{path.stem}_{source.path.stem}.urdf" for source in sources)
+    return tuple(f"{path.stem}_{source.stem}.urdf" for source in sources)
 
 
 def write_identified_urdfs(
@@ -103,19 +103,25 @@ def write_identified_urdfs(
     wanted = system.model_at(theta, at_keyframe=False)
     files = {}
     remarks = []
-    for name, source in zip(urdf_files(path, system.model_path), sources, strict=True):
+    names = urdf_files(path, system.model_path)
+    for name, (source, prefixes) in zip(names, sources.items(), strict=True):
         try:
-            _write(path.with_name(name), source, system, wanted)
+            if len(prefixes) > 1:
+                raise ModelError(
+                    f"{source.name} is attached {len(prefixes)} times, and one URDF has one set of "
+                    "values"
+                )
+            _write(path.with_name(name), source, prefixes[0], system, wanted)
         except ModelError as error:
             remarks.append(f"{name}: not written: {error}")
         else:
-            files[source.path.resolve()] = path.with_name(name)
+            files[source.resolve()] = path.with_name(name)
 
     missing = [each.name for each in system.parameters.parameters if not _is_held(each)]
     if missing and files:
-        names = first_ones([file.name for file in files.values()])
+        written = first_ones([file.name for file in files.values()])
         remarks.append(
-            f"{names}: a URDF cannot hold {first_ones(missing)}; {path.name} has all values"
+            f"{written}: a URDF cannot hold {first_ones(missing)}; {path.name} has all values"
         )
     return files, remarks
 
@@ -133,17 +139,10 @@ def _is_held(parameter: Parameter) -> bool:
     )
 
 
-def _write(path: Path, source: UrdfSource, system: System, wanted: Any) -> None:
+def _write(path: Path, source: Path, prefix: str, system: System, wanted: Any) -> None:
     """Write one URDF; raise ModelError, with a clause, where it cannot have the values."""
-    if len(source.prefixes) > 1:
-        raise ModelError(
-            f"{source.path.name} is attached {len(source.prefixes)} times, and one URDF has one "
-            "set of values"
-        )
-
-    (prefix,) = source.prefixes
-    xml, old = ModelXml(source.path, system.source.read), system.model
-    stated = _loaded(source.path, "MuJoCo does not load the URDF alone", system.source.files)
+    xml, old = ModelXml(source, system.source.read), system.model
+    stated = _loaded(source, "MuJoCo does not load the URDF alone", system.source.files)
     inertias = {}
     for link in xml.root.iterchildren("link"):
         name = link.get("name")
