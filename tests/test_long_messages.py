@@ -15,13 +15,13 @@ from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
 from mjfim.identification.starts import divergence_at_start
 from mjfim.output.campaign_folder import accuracy_sentence
-from mjfim.records.campaign import missed_targets
 from mjfim.records.check import (
     Combination,
     ParameterGroup,
     groups_in_words,
 )
 from mjfim.records.rehearsal import FiniteSteps
+from mjfim.records.studies import missed_targets
 
 # Longest message [characters].
 LONGEST_MESSAGE = 600

@@ -69,6 +69,18 @@ STEPS: Mapping[str, tuple[str, ...]] = {
 }
 ORDER = tuple(name for names in STEPS.values() for name in names)
 
+# Files of verbs that share one; every other verb has a file of its own name.
+FILES = {
+    "list": "inventory",
+    "validate": "inventory",
+    "rehearse": "check",
+    "compare-robots": "compare",
+    "montecarlo": "simulate",
+    "export": "results",
+    "report": "results",
+    "replay": "results",
+}
+
 # Number of tasks where it is not known before the work begins: as many processes as there may be.
 MAX_PARTS = 1_000_000
 

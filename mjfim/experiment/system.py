@@ -21,12 +21,11 @@ from numpy.typing import ArrayLike
 
 from mjfim.arrays import Array, record
 from mjfim.errors import ExperimentError, ModelError, SimulationDivergedError, listed
-from mjfim.experiment.controllers import resolve_controllers
 from mjfim.experiment.initial import initial_state, keyframe
-from mjfim.experiment.outputs import resolve_outputs
 from mjfim.experiment.packing import for_workers, model_of
 from mjfim.experiment.parameters import resolve_parameters
 from mjfim.experiment.schema import Experiment, ExperimentLike, experiment_of
+from mjfim.experiment.signals import resolve_controllers, resolve_outputs
 from mjfim.experiment.stated_units import require_units
 from mjfim.experiment.time_grid import TimeGrid, noise_strides
 from mjfim.model.clearance import with_floor

@@ -35,13 +35,12 @@ from mjfim.output.plots.pictures import kind_of_picture, pictures_of
 from mjfim.output.plots.plotly import Group, group_of
 from mjfim.output.video import Video
 from mjfim.records.base import ShownRecord
-from mjfim.records.campaign import Campaign
 from mjfim.records.check import Check
 from mjfim.records.design import Design
 from mjfim.records.estimate import Estimate
 from mjfim.records.rehearsal import Rehearsal
 from mjfim.records.robots import RobotComparison
-from mjfim.records.studies import Comparison, MonteCarloStudy
+from mjfim.records.studies import Campaign, Comparison, MonteCarloStudy
 from mjfim.records.worth import Watch, Worth
 
 if TYPE_CHECKING:

@@ -15,7 +15,7 @@ from rich.style import Style
 from rich.text import Text as Styled
 
 from mjfim.output.page import Emphasis, Listing, Page, Row, Table, Text
-from mjfim.records.verdict import Level
+from mjfim.records.base import Level
 
 # Largest number of remarks of each weight that the short form shows.
 MOST = {"Fix first": 1, "Warning": 2, "Detail": 0}

@@ -9,10 +9,9 @@ import numpy as np
 
 from mjfim.arrays import NORMAL_95, Array, finite_or_nan, record
 from mjfim.errors import first_ones, shortened
-from mjfim.records.base import Record, no_array
+from mjfim.records.base import ParameterResult, ParameterValue, Record, no_array
 from mjfim.records.design import CombinationAccuracy, LimitViolation
 from mjfim.records.rehearsal import FiniteSteps, Rehearsal, Valley
-from mjfim.records.values import ParameterResult, ParameterValue
 from mjfim.records.worth import Worth
 
 # A coefficient that differs from 1 by less than this number is not written.

@@ -24,9 +24,9 @@ from mjfim.output.folders import find_experiment_file
 from mjfim.output.pages import page_of
 from mjfim.output.plots.studies import fan_panels
 from mjfim.output.words import format_number
+from mjfim.records.base import Level
 from mjfim.records.design import Design, keeps_limits
 from mjfim.records.rehearsal import FiniteSteps
-from mjfim.records.verdict import Level
 from tests.support.cli import run
 from tests.support.limits import played
 from tests.support.paths import MODELS

@@ -20,10 +20,10 @@ from mjfim.output.pages.estimate import selection_parts
 from mjfim.output.rerun.documents import as_markdown
 from mjfim.output.terminal import TerminalPage
 from mjfim.output.words import improvement, relative
-from mjfim.records.base import ShownRecord
-from mjfim.records.campaign import CampaignStatus
+from mjfim.records.base import Level, ShownRecord, Verdict
 from mjfim.records.check import findings_of_check
 from mjfim.records.design import CombinationAccuracy, LimitViolation, ScaledStart, Status
+from mjfim.records.studies import CampaignStatus
 from mjfim.records.terms import (
     AlternativeTerm,
     Decision,
@@ -32,7 +32,6 @@ from mjfim.records.terms import (
     Term,
     TermTestData,
 )
-from mjfim.records.verdict import Level, Verdict
 from mjfim.studies.selected_models import possible_pools, selected_experiment
 from tests.support import results
 from tests.support.pages import page_with, printed, sentences

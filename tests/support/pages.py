@@ -6,7 +6,7 @@ from rich.console import Console
 
 from mjfim.output.page import Page, Part, Text
 from mjfim.output.terminal import TerminalPage
-from mjfim.records.verdict import Level, Verdict
+from mjfim.records.base import Level, Verdict
 
 
 def printed(page: Page, width: int = 200, *, verbose: bool = False) -> str:

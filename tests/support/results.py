@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 
 from mjfim.arrays import Array
-from mjfim.records.campaign import Campaign, CampaignStatus, Round
 from mjfim.records.check import Check, ConfoundedPair, ParameterCheck, SelfTest
 from mjfim.records.design import (
     Design,
@@ -34,9 +33,12 @@ from mjfim.records.rehearsal import (
 from mjfim.records.robots import RobotComparison
 from mjfim.records.studies import (
     DESIGN,
+    Campaign,
+    CampaignStatus,
     Comparison,
     MethodOutcome,
     MonteCarloStudy,
+    Round,
     TrialStatistics,
 )
 from mjfim.records.terms import Term, TermNumber

@@ -36,6 +36,7 @@ from mjfim.output.words import (
     sigma_remark,
     when_learnt,
 )
+from mjfim.records.base import Level, Verdict
 from mjfim.records.check import Check, ParameterCheck, ParameterGroup, unknown_groups
 from mjfim.records.design import (
     TIE_TOLERANCE,
@@ -46,7 +47,6 @@ from mjfim.records.design import (
     keeps_limits,
 )
 from mjfim.records.rehearsal import REST_SHARE, Rehearsal, RehearsedLimit, Valley
-from mjfim.records.verdict import Level, Verdict
 
 # Ratio of two standard deviations above which one of them counts as smaller.
 RELEVANT_RATIO = 1.05

@@ -18,8 +18,8 @@ from mjfim.output.page import (
     number,
 )
 from mjfim.recordings.read import ColumnSummary, LogSummary
+from mjfim.records.base import Level, Verdict
 from mjfim.records.inventory import Inventory, StatedExperiment
-from mjfim.records.verdict import Level, Verdict
 
 # Jitter of a log below this fraction of the sample period is round-off of the time stamps.
 JITTER_ROUND_OFF = 1e-6
