@@ -124,7 +124,7 @@ def _recordings(system: System, given: RecordingLike) -> Iterator[Recording]:
                     f"{name}: {channels.spec.time!r} is missing, the time of each row [s]"
                 )
             table = table_of_arrays(Path(name), _by_column(name, columns), channels.spec)
-            yield log_of(replace(table, is_file=False), channels).recording
+            yield log_of(replace(table, is_file=False), channels)[0]
 
 
 def _by_column(name: str, columns: Mapping[str, Any]) -> dict[str, Any]:

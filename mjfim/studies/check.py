@@ -43,7 +43,7 @@ from mjfim.experiment.given import RecordingsLike, TrajectoryLike, recordings_of
 from mjfim.experiment.initial import multisine
 from mjfim.experiment.schema import ExperimentLike
 from mjfim.experiment.stated_units import probable_degrees
-from mjfim.experiment.system import System, SystemOrder
+from mjfim.experiment.system import System, SystemOrder, order_of
 from mjfim.identification.fit_problem import FitProblem, sensitivity_rows
 from mjfim.identification.fit_workers import FitWorkers
 from mjfim.identification.search import refuse_same_data
@@ -432,7 +432,7 @@ def _identifiability_test(
 
     def make(threads: int) -> Callable[[], IdentifiabilityTest]:
         """Return what makes the test in a worker."""
-        return partial(_made_test, SystemOrder.of(task.system, threads), test.theta, test.earlier)
+        return partial(_made_test, order_of(task.system, threads), test.theta, test.earlier)
 
     def differentiated(probes: Iterable[Trajectory]) -> Iterator[RowsAndError | None]:
         """Differentiate motions on the workers."""
@@ -441,9 +441,9 @@ def _identifiability_test(
     return replace(test, differentiated=differentiated)
 
 
-def _made_test(system: SystemOrder, theta: Array, earlier: Array) -> IdentifiabilityTest:
+def _made_test(order: SystemOrder, theta: Array, earlier: Array) -> IdentifiabilityTest:
     """Make a test in a worker, which has no random motions of its own."""
-    made = system.system()
+    made = order()
     return IdentifiabilityTest(
         plant=made.plant,
         parameters=made.parameters,
