@@ -382,9 +382,9 @@ def print_result(
 
         typer.echo(json_of(values), nl=False)
     else:
-        from mjfim.output.terminal import TerminalPage
+        from mjfim.output.terminal import laid_out
 
-        out.print(TerminalPage(page, verbose))
+        out.print(laid_out(page, out, verbose=verbose))
 
 
 # ---- files
