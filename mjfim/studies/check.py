@@ -59,9 +59,7 @@ from mjfim.parallel.budget import Budget, StopToken, stop_on_interrupt
 from mjfim.plant.active_constraints import first_active_constraint
 from mjfim.plant.mixed_derivatives import CENTRAL_DIFFERENCES
 from mjfim.records.check import (
-    CONFOUNDED_CORRELATION,
     Check,
-    ConfoundedPair,
     ParameterCheck,
     SelfTest,
     findings_of_check,
@@ -564,12 +562,6 @@ def _checked(
     groups = found.groups_along_trajectory if here.count > everywhere.count else ()
     not_excited = tuple(group for group in groups if str(group) not in never)
     values = task.theta[task.parameters.interest]
-    pairs = [
-        ConfoundedPair(
-            first=found.names[i], second=found.names[j], correlation=float(correlation[i, j])
-        )
-        for i, j in np.argwhere(np.triu(np.abs(correlation) > CONFOUNDED_CORRELATION, k=1)).tolist()
-    ]
 
     check = Check(
         source=source,
@@ -579,7 +571,6 @@ def _checked(
         information=total,
         eigenvalues=np.maximum(eigenvalues, 0.0),
         correlation=correlation,
-        confounded=tuple(sorted(pairs, key=lambda pair: -abs(pair.correlation))),
         not_separable=found.groups_along_all,
         not_excited=not_excited,
         self_test=tested,

@@ -334,11 +334,11 @@ def _log_rehearsed(
     rec: rr.RecordingStream, model: mujoco.MjModel, rehearsal: Rehearsal, designed: BodyPoses
 ) -> None:
     """Log the paths of the ends of robots that play the design, and the ends as moving points."""
-    motions, end = rehearsal.motions, end_point(model, designed)
-    if motions is None or end is None:
+    t, motions, end = rehearsal.motion_times, rehearsal.motions, end_point(model, designed)
+    if end is None:
         return
-    paths = [body_poses(model, motions.t, qpos).world_paths(*end)[:, 0] for qpos in motions.qpos]
-    unsafe = rehearsal.unsafe[list(motions.robots)]
+    paths = [body_poses(model, t, qpos).world_paths(*end)[:, 0] for qpos in motions.values()]
+    unsafe = rehearsal.unsafe[list(motions)]
     for name, colour, chosen in (
         ("robots that leave no limit", rgb(MEASURED), ~unsafe),
         ("robots that leave a limit", rgb(NOMINAL), unsafe),
@@ -353,8 +353,8 @@ def _log_rehearsed(
         look = rr.Points3D.from_fields(colors=[colour], radii=rr.Radius.ui_points(3.0))
         rec.log(entity_path((*parts, "ends")), look, static=True, strict=True)
         ends = rr.Points3D.columns(positions=np.stack(found, axis=1).reshape(-1, 3))
-        rows = ends.partition([len(found)] * len(motions.t))
-        rec.send_columns(entity_path((*parts, "ends")), [time_column(motions.t)], rows, strict=True)
+        rows = ends.partition([len(found)] * len(t))
+        rec.send_columns(entity_path((*parts, "ends")), [time_column(t)], rows, strict=True)
 
 
 # ---- layout
