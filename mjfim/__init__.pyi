@@ -24,13 +24,13 @@ from mjfim.parallel import Pool as Pool
 from mjfim.parallel import Workers as Workers
 from mjfim.parallel.budget import Budget as Budget
 from mjfim.parallel.budget import StopToken as StopToken
-from mjfim.records.campaign import Campaign as Campaign
 from mjfim.records.check import Check as Check
 from mjfim.records.design import Design as Design
 from mjfim.records.estimate import Estimate as Estimate
 from mjfim.records.estimate_parts import InverseDynamicsFit as InverseDynamicsFit
 from mjfim.records.rehearsal import Rehearsal as Rehearsal
 from mjfim.records.robots import RobotComparison as RobotComparison
+from mjfim.records.studies import Campaign as Campaign
 from mjfim.records.studies import Comparison as Comparison
 from mjfim.records.studies import MonteCarloStudy as MonteCarloStudy
 from mjfim.records.trajectory import Recording as Recording

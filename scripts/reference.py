@@ -28,7 +28,7 @@ from mjfim.cli.common import app
 from mjfim.experiment.schema import json_schema
 from mjfim.model.paths import MODEL_ARRAYS, fields_of
 from mjfim.model.terms.library import KINDS
-from mjfim.records.verdict import Verdict
+from mjfim.records.base import Verdict
 
 FOLDER = Path(__file__).resolve().parent.parent / "docs" / "reference"
 SCHEMA = FOLDER / "experiment.schema.json"

@@ -15,13 +15,12 @@ from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
 from mjfim.identification.starts import divergence_at_start
 from mjfim.output.campaign_folder import accuracy_sentence
-from mjfim.records.campaign import missed_targets
 from mjfim.records.check import (
-    Combination,
     ParameterGroup,
     groups_in_words,
 )
 from mjfim.records.rehearsal import FiniteSteps
+from mjfim.records.studies import missed_targets
 
 # Longest message [characters].
 LONGEST_MESSAGE = 600
@@ -38,14 +37,14 @@ NAMES = tuple(f"inertia_of_link_{i}" for i in range(300))
 GROUP = ParameterGroup(
     members=NAMES,
     combinations=tuple(
-        Combination(members=NAMES, coefficients=(1.0, *(0.1234 * (i + j) for j in range(1, 300))))
+        dict(zip(NAMES, (1.0, *(0.1234 * (i + j) for j in range(1, 300))), strict=True))
         for i in range(50)
     ),
 )
 SILENT = ParameterGroup(members=NAMES, combinations=())
 SHORT = ParameterGroup(
     members=("mass", "gravity"),
-    combinations=(Combination(members=("mass", "gravity"), coefficients=(1.0, 2.0)),),
+    combinations=({"mass": 1.0, "gravity": 2.0},),
 )
 
 

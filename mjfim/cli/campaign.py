@@ -64,7 +64,7 @@ def campaign(
     from mjfim.experiment.packing import with_model
     from mjfim.output.campaign_folder import CampaignFolder, campaign_settings
     from mjfim.output.pages.studies import campaign_page
-    from mjfim.records.campaign import CampaignStatus
+    from mjfim.records.studies import CampaignStatus
 
     stated = with_target_accuracies(with_model(stated), wanted)
     task = DesignTask.resolve(stated, threads=run.threads)
@@ -130,7 +130,7 @@ class _Lab:
     def campaign(self, measure: Any, workers: Any) -> mjfim.Campaign:
         """Identify from the recordings in the folder, and make the further rounds."""
         from mjfim.excitation.shortest_horizon import target_accuracies
-        from mjfim.records.campaign import CampaignStatus
+        from mjfim.records.studies import CampaignStatus
 
         done = list(self.folder.recorded_rounds())
         self._begin_round(len(done))
@@ -186,7 +186,7 @@ class _Lab:
         """Show the progress, and write and print the estimate of a complete round."""
         from mjfim.excitation.shortest_horizon import target_accuracies
         from mjfim.output.campaign_folder import accuracy_sentence
-        from mjfim.records.campaign import Round
+        from mjfim.records.studies import Round
 
         finished = getattr(event, "result", None)
         if not isinstance(finished, Round):

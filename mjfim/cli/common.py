@@ -69,6 +69,18 @@ STEPS: Mapping[str, tuple[str, ...]] = {
 }
 ORDER = tuple(name for names in STEPS.values() for name in names)
 
+# Files of verbs that share one; every other verb has a file of its own name.
+FILES = {
+    "list": "inventory",
+    "validate": "inventory",
+    "rehearse": "check",
+    "compare-robots": "compare",
+    "montecarlo": "simulate",
+    "export": "results",
+    "report": "results",
+    "replay": "results",
+}
+
 # Number of tasks where it is not known before the work begins: as many processes as there may be.
 MAX_PARTS = 1_000_000
 
@@ -370,9 +382,9 @@ def print_result(
 
         typer.echo(json_of(values), nl=False)
     else:
-        from mjfim.output.terminal import TerminalPage
+        from mjfim.output.terminal import laid_out
 
-        out.print(TerminalPage(page, verbose))
+        out.print(laid_out(page, out, verbose=verbose))
 
 
 # ---- files

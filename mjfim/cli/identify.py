@@ -108,7 +108,7 @@ def identify(
 
     with progress("reading"):
         logs = [read_log(path, system.channels) for path in (*fitted_paths, *held_out_paths)]
-    read = [log.recording for log in logs]
+    read = [recording for recording, _ in logs]
     fitted, kept = read[: len(fitted_paths)], read[len(fitted_paths) :]
     with (
         run.workers() as workers,
@@ -127,7 +127,7 @@ def identify(
     if samples:
         result, not_drawn = _with_draws(result, system, samples, seed)
 
-    sections = {"Logs": log_tables([log.summary for log in logs])} if run.verbose else {}
+    sections = {"Logs": log_tables([summary for _, summary in logs])} if run.verbose else {}
     remarks = [f"warning: --samples: no robots were drawn{not_drawn}"] if not_drawn else []
     code = run.finish(result, system, sections=sections, remarks=remarks)
     write_wanted_video(video, system, result)

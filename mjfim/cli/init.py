@@ -115,7 +115,7 @@ def _recording(log: Path, proposal: Proposal) -> str:
     """The table `[recording]` that is proposed for a log."""
     import numpy as np
 
-    from mjfim.experiment.outputs import columns_of_keys
+    from mjfim.experiment.signals import columns_of_keys
     from mjfim.model.coordinates import ModelCoordinates
     from mjfim.recordings.channels import Channels
     from mjfim.recordings.formats import read_columns

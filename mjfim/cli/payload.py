@@ -68,7 +68,7 @@ def payload(
 
     from mjfim.experiment.packing import with_model
     from mjfim.output.folders import identified_models
-    from mjfim.recordings.read import read_log, recording_paths
+    from mjfim.recordings.read import read_recording, recording_paths
     from mjfim.studies.payload import PayloadTask
 
     task = PayloadTask.of(
@@ -87,7 +87,7 @@ def payload(
     run.claim(mjfim.Estimate, stated, [*recordings, *(without or []), robot], models)
 
     with progress("reading"):
-        logs = [read_log(path, system.channels).recording for path in (*paths, *unloaded)]
+        logs = [read_recording(path, system.channels) for path in (*paths, *unloaded)]
     with progress("fitting the payload") as display:
         result, loaded = task.identify(
             logs[: len(paths)], without=logs[len(paths) :], callback=display

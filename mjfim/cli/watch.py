@@ -175,7 +175,7 @@ def _table() -> Iterator[Callable[[Any], None]]:
     from rich.live import Live
 
     from mjfim.output.pages import page_of
-    from mjfim.output.terminal import TerminalPage
+    from mjfim.output.terminal import laid_out
 
     told = time.monotonic()
     with Live(console=errors, auto_refresh=False, transient=True) as drawn:
@@ -185,7 +185,8 @@ def _table() -> Iterator[Callable[[Any], None]]:
             nonlocal told
             if errors.is_terminal:
                 has_room = errors.height >= len(event.result.parameters) + LINES_BESIDE_ROWS
-                drawn.update(TerminalPage(page_of(event.result), has_room), refresh=True)
+                page = page_of(event.result)
+                drawn.update(laid_out(page, errors, verbose=has_room), refresh=True)
             elif time.monotonic() - told >= LINE_SECONDS:
                 told = time.monotonic()
                 say(f"{event.result.seconds:.1f} s: {event.message}")

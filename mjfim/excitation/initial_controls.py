@@ -14,7 +14,7 @@ from mjfim.excitation.search.levels import boundary_splines
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.initial import fourier_basis, independent_curves
 from mjfim.experiment.packing import opened
-from mjfim.recordings.control_table import read_control
+from mjfim.recordings.delimited import read_control
 
 # Largest number of harmonics of a Fourier series.
 MAX_SERIES_HARMONICS = 15

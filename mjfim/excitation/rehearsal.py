@@ -42,9 +42,8 @@ from mjfim.records.rehearsal import (
     REST_SHARE,
     Fan,
     FiniteSteps,
+    LimitRange,
     Rehearsal,
-    RehearsedLimit,
-    RobotMotions,
 )
 from mjfim.records.trajectory import Trajectory
 
@@ -239,7 +238,8 @@ def rehearsed(
         kept_reserve=None if reserve == "auto" else dict[str, float](reserve.items()),
         end=task.experiment.boundary.end,
         fans=tuple(_fans(player, parts, after)),
-        motions=_motions_of(player, parts),
+        motion_times=player.t[::MOTION_STEP],
+        motions=_motions_of(parts),
         **measured,
     )
 
@@ -279,18 +279,12 @@ def _fans(player: _RobotPlayer, parts: Sequence[_Played], after: Sequence[Array]
         )
 
 
-def _motions_of(player: _RobotPlayer, parts: Sequence[_Played]) -> RobotMotions | None:
+def _motions_of(parts: Sequence[_Played]) -> dict[int, Array]:
     """Choose motions of robots to be drawn, from the one closest to its limits to the safest."""
-    known = [i for i, each in enumerate(parts) if i and each.qpos is not None]
-    known.sort(key=lambda i: parts[i].margins.min(initial=np.inf))
-    chosen = [known[k] for k in evenly_spread_indices(len(known), MAX_MOTIONS)]
-    if not chosen:
-        return None
-    return RobotMotions(
-        robots=tuple(chosen),
-        t=player.t[::MOTION_STEP],
-        qpos=np.array([parts[i].qpos for i in chosen]),
-    )
+    known = {i: each.qpos for i, each in enumerate(parts) if i and each.qpos is not None}
+    order = sorted(known, key=lambda i: parts[i].margins.min(initial=np.inf))
+    chosen = (order[k] for k in evenly_spread_indices(len(order), MAX_MOTIONS))
+    return {i: known[i].astype(np.float64) for i in chosen}
 
 
 def draw_robot(
@@ -443,7 +437,7 @@ class _RobotPlayer:
         positions = [split_unit(label) for label in labels_of_model(model).positions]
         self._free = [dof for dof, (name, _) in enumerate(positions) if name not in placed]
         ranges = self.rehearsed_limits()
-        free = RehearsedLimit(kind="position", name="", lower=-np.inf, upper=np.inf, scale=1.0)
+        free = LimitRange(kind="position", name="", lower=-np.inf, upper=np.inf)
         self.shown = [ranges[i] for i in self.limited]
         for name, unit in (positions[dof] for dof in self._free):
             self.shown.append(replace(free, name=name, unit=unit))
@@ -480,10 +474,10 @@ class _RobotPlayer:
             pairs = find_geom_pairs(model, ignored)
             self._distances = GeomDistances(model, pairs, float(model_length(model)))
 
-    def rehearsed_limits(self) -> tuple[RehearsedLimit, ...]:
+    def rehearsed_limits(self) -> tuple[LimitRange, ...]:
         """The limits in the order of the margins."""
         found = [
-            RehearsedLimit(
+            LimitRange(
                 kind=limit.kind,
                 name=limit.name,
                 lower=limit.lower,
@@ -496,7 +490,7 @@ class _RobotPlayer:
         nearest = self.constraints.clearance
         if nearest is not None:
             found.append(
-                RehearsedLimit(
+                LimitRange(
                     kind="clearance",
                     name="nearest pair",
                     lower=nearest.least,

@@ -38,9 +38,9 @@ from mjfim.experiment.system_tables import Signal
 from mjfim.parallel import ExecutorLike, Workers
 from mjfim.parallel.budget import StopToken, stop_on_interrupt
 from mjfim.records.base import SavedRecord
-from mjfim.records.campaign import missed_targets
 from mjfim.records.design import Design, Status
 from mjfim.records.events import Callback, StudyEvent, shown_progress
+from mjfim.records.studies import missed_targets
 
 # Factor between two successive numbers of samples where the ratio is infinite. An infinite ratio
 # does not show how far the target is.

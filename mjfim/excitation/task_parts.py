@@ -26,7 +26,7 @@ from mjfim.model.coordinates import joint_dofs, joint_names
 from mjfim.model.parameters import sample_parameters
 from mjfim.model.variants import Relaxation
 from mjfim.plant.batch import BatchSimulator
-from mjfim.recordings.control_table import read_control
+from mjfim.recordings.delimited import read_control
 from mjfim.records.trajectory import Trajectory
 
 

@@ -13,7 +13,6 @@ from numpy.typing import ArrayLike
 
 from mjfim.errors import ExperimentError, RecordingError, in_words, unknown
 from mjfim.experiment.arguments import is_numeric
-from mjfim.experiment.sysid import columns_of
 from mjfim.experiment.system import System
 from mjfim.recordings.formats import table_of_arrays
 from mjfim.recordings.read import log_of, read_recording, recording_paths
@@ -47,6 +46,9 @@ NO_ARRAYS: Mapping[str, Any] = MappingProxyType({})
 
 # Relative deviation of two sample periods that is round-off.
 PERIOD_TOLERANCE = 1e-6
+
+# Ends of the names of signals of sysid, and what mjfim calls them.
+SUFFIXES = {"MjStateQPos": "qpos", "MjStateQVel": "qvel", "MjCtrl": "ctrl"}
 
 # Name of a recording that is given as arrays.
 ARRAYS_NAME = "arrays"
@@ -113,7 +115,7 @@ def _recordings(system: System, given: RecordingLike) -> Iterator[Recording]:
             yield read_recording(path, channels)
     else:
         # The table is about logs; MuJoCo's arrays have MuJoCo's names and units.
-        pairs = [(ARRAYS_NAME, given)] if isinstance(given, Mapping) else columns_of(given)
+        pairs = [(ARRAYS_NAME, given)] if isinstance(given, Mapping) else _columns_of(given)
         if not (isinstance(given, Mapping) and given.keys() - ARRAY_NAMES):
             channels = replace(channels, spec=RecordingSpec(gap=channels.spec.gap))
         for name, columns in pairs:
@@ -122,7 +124,7 @@ def _recordings(system: System, given: RecordingLike) -> Iterator[Recording]:
                     f"{name}: {channels.spec.time!r} is missing, the time of each row [s]"
                 )
             table = table_of_arrays(Path(name), _by_column(name, columns), channels.spec)
-            yield log_of(replace(table, is_file=False), channels).recording
+            yield log_of(replace(table, is_file=False), channels)[0]
 
 
 def _by_column(name: str, columns: Mapping[str, Any]) -> dict[str, Any]:
@@ -141,3 +143,25 @@ def _by_column(name: str, columns: Mapping[str, Any]) -> dict[str, Any]:
         array = np.asarray(values)
         found[key] = array[:, 0] if array.ndim == 2 and array.shape[1] == 1 else array
     return found
+
+
+def _columns_of(sequences: Any) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Names and columns of the sequences of a `ModelSequences`; their initial states are not used.
+
+    A time of a measurement is that of the state that is measured.
+    """
+    for name, control, measured in zip(
+        sequences.sequence_name, sequences.control, sequences.sensordata, strict=True
+    ):
+        t = np.union1d(control.times, measured.times)
+        columns = {"t": t}
+        for series, whole in ((control, "ctrl"), (measured, "sensordata")):
+            rows = np.full((len(t), series.data.shape[1]), np.nan)
+            rows[np.searchsorted(t, series.times)] = series.data
+            for signal, (kind, indices) in (series.signal_mapping or {whole: (None, ...)}).items():
+                quantity = SUFFIXES.get(getattr(kind, "name", ""))
+                key = signal
+                if quantity is not None:
+                    key = f"{quantity}:{signal.removesuffix(f'_{quantity}')}"
+                columns[key] = rows[:, indices]
+        yield name, columns

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import tomllib
 from collections.abc import Mapping
+from copy import deepcopy
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,6 @@ from pydantic_core import PydanticSerializationError
 from mjfim.arrays import Array
 from mjfim.errors import ExperimentError, ModelError, unknown
 from mjfim.experiment.arguments import checked
-from mjfim.experiment.sysid import parameter_tables
 from mjfim.experiment.system_tables import (
     ControllerSpec,
     Correlated,
@@ -382,6 +382,48 @@ def _tables(parameters: Any) -> Any:
         name: {"target": table} if isinstance(table, str) else table
         for name, table in parameters.items()
     }
+
+
+def parameter_tables(parameters: Any) -> dict[str, dict[str, Any]]:
+    """Tables of parameters of a `ParameterDict`, without the frozen ones.
+
+    A modifier becomes a `function`. A parameter without one is a path by its name, or changes the
+    guess and the bounds of the parameter that an experiment has under this name.
+    """
+    tables = {}
+    for name, each in parameters.items():
+        numbers = (
+            [] if each.frozen else list(zip(each.as_vector(), *each.get_bounds(), strict=True))
+        )
+        waiting: dict[int, list[float]] = {}
+        for i, (value, low, high) in enumerate(numbers):
+            key = name if len(numbers) == 1 else f"{name}[{i}]"
+            tables[key] = {"guess": float(value), "bounds": [float(low), float(high)]}
+            if each.modifier is not None:
+                tables[key]["function"] = _Edit(each, i, waiting)
+            elif ":" in name:
+                tables[key]["target"] = key
+    return tables
+
+
+class _Edit:
+    """Function of an MjSpec for one number of a parameter whose modifier needs all of them.
+
+    The numbers are edited in their order, and the last one calls the modifier.
+    """
+
+    def __init__(self, parameter: Any, index: int, waiting: dict[int, list[float]]) -> None:
+        self._parameter, self._index, self._waiting = parameter, index, waiting
+
+    def __call__(self, spec: Any, value: float) -> None:
+        """Edit the spec."""
+        if self._index == 0:
+            self._waiting[id(spec)] = []
+        self._waiting[id(spec)].append(value)
+        if self._index == self._parameter.size - 1:
+            changed = deepcopy(self._parameter)
+            changed.update_from_vector(np.array(self._waiting.pop(id(spec))))
+            changed.modifier(spec, changed)
 
 
 def json_schema() -> dict[str, Any]:

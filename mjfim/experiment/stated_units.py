@@ -14,8 +14,8 @@ import numpy as np
 from pydantic import BaseModel
 
 from mjfim.errors import ExperimentError
-from mjfim.experiment.outputs import columns_of_keys
 from mjfim.experiment.schema import Experiment
+from mjfim.experiment.signals import columns_of_keys
 from mjfim.experiment.system_tables import ParameterSpec
 from mjfim.model.elements import identifier
 from mjfim.model.limited_elements import LimitedElement, limited_elements

@@ -9,9 +9,9 @@ and records take the labels of its joints, controls, parameters and outputs.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -21,12 +21,11 @@ from numpy.typing import ArrayLike
 
 from mjfim.arrays import Array, record
 from mjfim.errors import ExperimentError, ModelError, SimulationDivergedError, listed
-from mjfim.experiment.controllers import resolve_controllers
 from mjfim.experiment.initial import initial_state, keyframe
-from mjfim.experiment.outputs import resolve_outputs
 from mjfim.experiment.packing import for_workers, model_of
 from mjfim.experiment.parameters import resolve_parameters
 from mjfim.experiment.schema import Experiment, ExperimentLike, experiment_of
+from mjfim.experiment.signals import resolve_controllers, resolve_outputs
 from mjfim.experiment.stated_units import require_units
 from mjfim.experiment.time_grid import TimeGrid, noise_strides
 from mjfim.model.clearance import with_floor
@@ -552,53 +551,46 @@ def simulate_system(
     )
 
 
-@record
-class SystemOrder:
-    """Data from which a worker process makes a system again. It can be pickled.
+# What makes a system again in a worker process. It can be pickled.
+SystemOrder = Callable[[], System]
 
-    Attributes:
-        experiment: The experiment, with its files.
-        initial_state: (ns,) nominal initial state.
-        substeps: Engine steps of a sample.
-        step_factors: (p,) factors of the difference steps; None where they are not calibrated.
-        threads: Threads for the engine.
+
+def order_of(system: System, threads: int) -> SystemOrder:
+    """Make the order with which a worker process makes a system again.
+
+    Args:
+        system: A system on the plant that the experiment states, or with other substeps.
+        threads: Threads that each worker may use.
     """
+    assert system.variant == STATED
+    return partial(
+        _ordered_system,
+        for_workers(system.experiment, system.source),
+        system.nominal_initial_state,
+        system.grid.substeps,
+        system.plant.step_factors,
+        threads,
+    )
 
-    experiment: Experiment
-    initial_state: Array
-    substeps: int
-    step_factors: Array | None
-    threads: int
 
-    @classmethod
-    def of(cls, system: System, threads: int) -> SystemOrder:
-        """Make the order of a system.
+def _ordered_system(
+    experiment: Experiment,
+    initial_state: Array,
+    substeps: int,
+    step_factors: Array | None,
+    threads: int,
+) -> System:
+    """Make a system again; the model is parsed once in a process."""
+    system = System.resolve(experiment, threads=threads)
+    if substeps != system.grid.substeps:
+        system = system.with_substeps(substeps)
 
-        Args:
-            system: A system on the plant that the experiment states, or with other substeps.
-            threads: Threads that each worker may use.
-        """
-        assert system.variant == STATED
-        return cls(
-            experiment=for_workers(system.experiment, system.source),
-            initial_state=system.nominal_initial_state,
-            substeps=system.grid.substeps,
-            step_factors=system.plant.step_factors,
-            threads=threads,
-        )
-
-    def system(self) -> System:
-        """Make the system; the model is parsed once in a process."""
-        system = System.resolve(self.experiment, threads=self.threads)
-        if self.substeps != system.grid.substeps:
-            system = system.with_substeps(self.substeps)
-
-        plant = system.plant.with_initial_state(self.initial_state)
-        return replace(
-            system,
-            nominal_initial_state=self.initial_state,
-            plant=plant.with_step_factors(self.step_factors),
-        )
+    plant = system.plant.with_initial_state(initial_state)
+    return replace(
+        system,
+        nominal_initial_state=initial_state,
+        plant=plant.with_step_factors(step_factors),
+    )
 
 
 def labels_of_model(model: mujoco.MjModel) -> Labels:

@@ -20,7 +20,7 @@ from typing import Any, Literal, TypeVar, cast
 
 import numpy as np
 
-from mjfim.experiment.system import System, SystemOrder
+from mjfim.experiment.system import System, SystemOrder, order_of
 from mjfim.identification.aligned_recording import AlignedRecording
 from mjfim.identification.fit_problem import FitProblem, ProblemWork
 from mjfim.parallel import (
@@ -88,7 +88,7 @@ def _made(
             for name in (ARRAYS if folder else ())
         }
         found.append(replace(recording, **arrays) if arrays else recording)
-    made = _systems.get(system.digest, lambda: system.value.system())
+    made = _systems.get(system.digest, lambda: system.value())
     return _with_parts(problem, made, tuple(found))
 
 
@@ -175,7 +175,7 @@ class FitWorkers:
         def parts() -> tuple[_SharedProblem, int]:
             """The problem in parts, and the size of what only this variant has."""
             made = problem.system
-            system = self._once(made, threads, lambda: (SystemOrder.of(made, threads), 0))
+            system = self._once(made, threads, lambda: (order_of(made, threads), 0))
             recordings = tuple(
                 self._once(each, 0, partial(self._sent, each)) for each in problem.recordings
             )

@@ -26,7 +26,12 @@ from mjfim.information.null_space import (
 from mjfim.model.parameters import ParameterSet
 from mjfim.plant.outputs import Noise
 from mjfim.plant.plant import SENSITIVITY_STEP, Plant
-from mjfim.records.check import ParameterGroup, combination_matrix, groups_in_words
+from mjfim.records.check import (
+    ParameterGroup,
+    combination_matrix,
+    combination_terms,
+    groups_in_words,
+)
 from mjfim.records.design import CombinationAccuracy
 from mjfim.records.trajectory import Sensitivity, Trajectory
 
@@ -89,7 +94,7 @@ class Identifiability:
         """
         rows = combination_matrix(self.groups_along_all, self.names)
         words = [
-            str(combination)
+            " ".join(combination_terms(combination))
             for group in self.groups_along_all
             for combination in group.combinations
         ]

@@ -252,13 +252,11 @@ def parameter_groups(
     for members in _joined(links):
         if members <= set(null.silent):
             continue
-        rows = []
+        rows: list[Combination] = []
         for b, row in zip(base.tolist(), coefficients, strict=True):
             if b in members:
-                used = [j for j in range(len(lumped)) if row[j] != 0.0]
-                combined = (names[b], *(names[lumped[j]] for j in used))
-                factors = (1.0, *(float(row[j]) for j in used))
-                rows.append(Combination(members=combined, coefficients=factors))
+                used = {names[lumped[j]]: float(row[j]) for j in np.flatnonzero(row).tolist()}
+                rows.append({names[b]: 1.0, **used})
         member_names = tuple(names[m] for m in sorted(members))
         groups.append(ParameterGroup(members=member_names, combinations=tuple(rows)))
 

@@ -13,6 +13,7 @@ ball and free joints are rotation vectors in the measured body's frame.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -35,7 +36,7 @@ from mjfim.plant.state_space import logarithm
 from mjfim.records.base import ShownRecord
 from mjfim.records.design import TRAJECTORY_ARRAYS, Design
 from mjfim.records.studies import Comparison
-from mjfim.records.trajectory import Labels, Playback, Recording, Trajectory
+from mjfim.records.trajectory import Labels, Recording, Trajectory
 
 # Angle of a whole turn [rad].
 TURN = 2.0 * np.pi
@@ -90,7 +91,9 @@ def rotation_vectors(quaternions: Array) -> Array:
     return vectors
 
 
-def simulate_playback(system: System, trajectory: Trajectory, gain: Array) -> Playback:
+def simulate_playback(
+    system: System, trajectory: Trajectory, gain: Array
+) -> tuple[Trajectory, Array]:
     """Simulate a designed trajectory at `playback_rate`, at the parameters of the design.
 
     Args:
@@ -99,7 +102,8 @@ def simulate_playback(system: System, trajectory: Trajectory, gain: Array) -> Pl
         gain: (N, nu, nx) feedback gains of the samples [control unit / state unit].
 
     Returns:
-        The trajectory and the gains, one row for each period of the controller.
+        The trajectory of M samples, one for each period of the controller, and the gains, which are
+        held over each sample of the design: (M, nu, nx).
 
     Raises:
         SimulationDivergedError: The simulation diverges.
@@ -109,21 +113,23 @@ def simulate_playback(system: System, trajectory: Trajectory, gain: Array) -> Pl
     held = np.repeat(trajectory.ctrl, rows, axis=0)
 
     states = _rollout(system, trajectory.state[:1], held, steps)
+    qpos, qvel, act = system.space.split(states)
     t = np.arange(len(held) + 1, dtype=np.float64) * (system.dt / rows)
-    return Playback(t=t, state=states, ctrl=held, gain=np.repeat(gain, rows, axis=0))
+    played = Trajectory(t=t, qpos=qpos, qvel=qvel, act=act, ctrl=held)
+    return played, np.repeat(gain, rows, axis=0)
 
 
-def design_columns(playback: Playback, system: System) -> dict[str, Array]:
+def design_columns(playback: Trajectory, gain: Array, system: System) -> dict[str, Array]:
     """Return the columns of `design.csv` by name, each (M+1,): time, state, controls and gains.
 
     Controls and gains hold until the next row; the last row has none (NaN).
 
     Args:
         playback: The design by periods of the controller, M of them.
+        gain: (M, nu, nx) feedback gains [control unit / state unit].
         system: The system.
     """
-    rows = len(playback.ctrl)
-    held = np.concatenate([playback.ctrl, playback.gain.reshape(rows, -1)], axis=1)
+    held = np.concatenate([playback.ctrl, gain.reshape(playback.samples, -1)], axis=1)
     held = np.concatenate([held, np.full((1, held.shape[1]), np.nan)])
     controls = [f"ctrl:{name}" for name in system.controls]
     gains = gain_names(system.model, system.controls)
@@ -133,7 +139,7 @@ def design_columns(playback: Playback, system: System) -> dict[str, Array]:
     return columns | dict(zip([*controls, *gains], held.T, strict=True))
 
 
-def reference_columns(playback: Playback, system: System) -> dict[str, Array]:
+def reference_columns(playback: Trajectory, system: System) -> dict[str, Array]:
     """Return the columns of `reference.csv` by name, each (M+1,).
 
     They hold the planned motion and the feed-forward forces that belong to it.
@@ -151,10 +157,9 @@ def reference_columns(playback: Playback, system: System) -> dict[str, Array]:
         system: The system.
     """
     held = np.concatenate([playback.ctrl, playback.ctrl[-1:]])
-    qpos, qvel, act = system.space.split(playback.state)
-    rows = Trajectory(t=playback.t, qpos=qpos, qvel=qvel, act=act, ctrl=held)
+    rows = replace(playback, ctrl=held)
 
-    force = np.empty_like(qvel)
+    force = np.empty_like(playback.qvel)
     for k, data in forward_samples(system.model_at(system.theta), rows, range(len(held))):
         force[k] = data.qfrc_actuator
 
@@ -167,7 +172,8 @@ def reference_columns(playback: Playback, system: System) -> dict[str, Array]:
     names = [component.name for component in state_components(system.model)]
     dofs = dof_names(system.model)
     columns = {"t": playback.t}
-    columns |= dict(zip(names, np.concatenate([qpos, qvel], axis=1).T, strict=True))
+    planned = np.concatenate([playback.qpos, playback.qvel], axis=1)
+    columns |= dict(zip(names, planned.T, strict=True))
     columns |= {f"qacc:{name}": qacc[:, i] for i, name in enumerate(dofs)}
     return columns | {f"force:{name}": force[:, i] for i, name in enumerate(dofs)}
 
@@ -216,9 +222,9 @@ def write_data(
 def _tables(record: ShownRecord, system: System) -> dict[str, Mapping[str, np.ndarray]]:
     """The columns of the tables of a result, by the names of the tables."""
     if isinstance(record, Design):
-        playback = simulate_playback(system, record.trajectory, record.final.gain)
+        playback, gain = simulate_playback(system, record.trajectory, record.final.gain)
         return {
-            "design": design_columns(playback, system),
+            "design": design_columns(playback, gain, system),
             "reference": reference_columns(playback, system),
         }
     if isinstance(record, Comparison):

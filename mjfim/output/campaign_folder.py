@@ -39,9 +39,9 @@ from mjfim.output.plots.pictures import Pictures
 from mjfim.output.report import write_report
 from mjfim.output.words import format_with_uncertainty
 from mjfim.recordings.read import read_recording
-from mjfim.records.campaign import Campaign, EarlierRound
 from mjfim.records.design import Design
 from mjfim.records.estimate import Estimate
+from mjfim.records.studies import Campaign, EarlierRound
 
 # Files of the estimate after a round.
 ESTIMATE_ARCHIVE = ("estimate.json", "estimate.npz")

@@ -88,19 +88,8 @@ ROBOT_COLOURS = [Term("", ROLES[role], ROLES[role], "") for role in ROBOT_ROLES]
 FLOOR_SPACING = 0.12
 
 
-@record
-class Track:
-    """One robot in a view.
-
-    Attributes:
-        term: Its word and its colour.
-        qpos: (F, nq) positions in each frame of the film.
-        is_ghost: Whether it is transparent.
-    """
-
-    term: Term
-    qpos: Array
-    is_ghost: bool
+# One robot in a view: its word with its colour, and its (F, nq) positions in the frames.
+Track = tuple[Term, Array]
 
 
 @record
@@ -108,8 +97,8 @@ class FilmView:
     """One picture of a frame.
 
     Attributes:
-        tracks: Its robots; those after the first one are ghosts behind it. A robot without a word
-            is not in the title.
+        tracks: Its robots; those after the first one are transparent ghosts behind it. A robot
+            without a word is not in the title.
         target: (F, 3) point at which the camera looks in each frame [m].
         trail: (n, 3) path of the body that the camera follows [m]; empty where it follows none.
     """
@@ -119,9 +108,9 @@ class FilmView:
     trail: Array
 
     @property
-    def named(self) -> list[Track]:
-        """One track for each word."""
-        return list({track.term: track for track in self.tracks if track.term}.values())
+    def named(self) -> dict[Term, bool]:
+        """The words of its robots, and whether they are ghosts."""
+        return {term: k > 0 for k, (term, _) in enumerate(self.tracks) if term}
 
 
 @record
@@ -181,8 +170,8 @@ class Film:
         pictures = []
         for view in self.views:
             robots = [
-                f"the {track.term} motion{' (transparent)' if track.is_ghost else ''}"
-                for track in view.named
+                f"the {term} motion{' (transparent)' if is_ghost else ''}"
+                for term, is_ghost in view.named.items()
             ]
             pictures.append(" and ".join(robots))
         shown = " beside ".join(pictures)
@@ -280,14 +269,14 @@ def robots_beside(
 
 def _rehearsed(rehearsal: Rehearsal | None) -> Iterator[tuple[Term, Trajectory]]:
     """Return motions of some robots, from the one closest to its limits to the safest."""
-    motions = None if rehearsal is None else rehearsal.motions
-    if rehearsal is None or motions is None:
+    if rehearsal is None:
         return
-    nothing = np.zeros((len(motions.t), 0))
-    for k in evenly_spread_indices(len(motions.robots), MAX_GHOSTS).tolist():
-        term = UNSAFE if rehearsal.unsafe[motions.robots[k]] else REHEARSED
-        qpos = motions.qpos[k]
-        yield term, Trajectory(t=motions.t, qpos=qpos, qvel=nothing, act=nothing, ctrl=nothing[1:])
+    t, motions = rehearsal.motion_times, list(rehearsal.motions.items())
+    nothing = np.zeros((len(t), 0))
+    for k in evenly_spread_indices(len(motions), MAX_GHOSTS).tolist():
+        robot, qpos = motions[k]
+        term = UNSAFE if rehearsal.unsafe[robot] else REHEARSED
+        yield term, Trajectory(t=t, qpos=qpos, qvel=nothing, act=nothing, ctrl=nothing[1:])
 
 
 def film_of_motions(
@@ -314,13 +303,10 @@ def film_of_motions(
     t = begin + np.linspace(0.0, shown, frames)
 
     tracks = [
-        tuple(
-            Track(term=term, qpos=positions_at(model, each.t, each.qpos, t), is_ghost=k > 0)
-            for k, (term, each) in enumerate(view)
-        )
+        tuple((term, positions_at(model, each.t, each.qpos, t)) for term, each in view)
         for view in motions
     ]
-    poses = [[body_poses(model, t, track.qpos) for track in view] for view in tracks]
+    poses = [[body_poses(model, t, qpos) for _, qpos in view] for view in tracks]
     nothing, points = np.zeros((0, 3)), evenly_spread_indices(frames, TRAIL_POINTS)
     followed = followed_body(model, [view[0] for view in poses])
     paths = [] if followed is None else [view[0].positions[:, followed] for view in poses]
@@ -537,11 +523,10 @@ class Painter:
         bold, plain = _font("DejaVuSans-Bold.ttf", TITLE_SIZE), _font("DejaVuSans.ttf", TITLE_SIZE)
         for k, view in enumerate(self._film.views):
             x = float(k * (self._film.camera.size[0] + GAP) + MARGIN)
-            for j, track in enumerate(view.named):
-                words = [(" and " if j else "", FAINT_INK, plain)]
-                words.append((track.term, track.term.rgb, bold))
+            for j, (term, is_ghost) in enumerate(view.named.items()):
+                words = [(" and " if j else "", FAINT_INK, plain), (term, term.rgb, bold)]
                 # Of three words, there is no room for more.
-                is_told = track.is_ghost and len(view.named) == 2
+                is_told = is_ghost and len(view.named) == 2
                 words.append((" (transparent)" if is_told else "", FAINT_INK, plain))
                 for word, colour, font in words:
                     text.text((x, TITLE_HEIGHT // 2), word, colour, font, anchor="lm")
@@ -558,19 +543,19 @@ class Painter:
     def _picture(self, view: FilmView, k: int) -> NDArray[np.uint8]:
         model, data, scene = self._film.model, self._data, self._renderer.scene
         self._camera.lookat[:] = view.target[k]
-        for layer, track in enumerate(view.tracks):
-            data.qpos[:] = track.qpos[k]
+        for layer, (term, qpos) in enumerate(view.tracks):
+            data.qpos[:] = qpos[k]
             mujoco.mj_fwdPosition(model, data)
-            first = scene.ngeom if track.is_ghost else 0
-            if track.is_ghost:
+            first = scene.ngeom if layer else 0
+            if layer:
                 # Bodies without geoms are decoration, which shows their inertia.
                 kinds = int(mujoco.mjtCatBit.mjCAT_DYNAMIC | mujoco.mjtCatBit.mjCAT_DECOR)
                 mujoco.mjv_addGeoms(model, data, self._option, mujoco.MjvPerturb(), kinds, scene)
             else:
                 self._renderer.update_scene(data, self._camera, self._option)
-            self._paint(track, first, layer)
+            self._paint(term, first, layer)
 
-        colour = (*(np.array(view.tracks[0].term.rgb) / 255.0), 1.0)
+        colour = (*(np.array(view.tracks[0][0].rgb) / 255.0), 1.0)
         for begin, end in pairwise(view.trail):
             _add_line(scene, begin, end, LINE_WIDTH * self._camera.distance, colour)
         self._add_floor(view.target[k])
@@ -578,10 +563,11 @@ class Painter:
             self._add_background()
         return np.asarray(self._renderer.render())
 
-    def _paint(self, track: Track, first: int, layer: int) -> None:
+    def _paint(self, term: Term, first: int, layer: int) -> None:
         """Tint the moving parts that were added to the scene from the number `first` on.
 
-        Each ghost lies in a layer behind the robots before it, so that it shows where it differs.
+        Layers behind the first one are ghosts, each behind the robots before it, so that it shows
+        where it differs.
         """
         for geom in self._renderer.scene.geoms[first : self._renderer.scene.ngeom]:
             is_moving = self._is_moving.get(geom.objtype, ())
@@ -589,10 +575,10 @@ class Painter:
                 # Parts with a colour nearly keep it.
                 own = np.array(geom.rgba[:3], dtype=np.float64)
                 purity = float(np.ptp(own)) / max(float(own.max()), 1e-3)
-                share = GHOST_TINT if track.is_ghost else TINT * (1.0 - KEPT_COLOUR * purity)
-                geom.rgba[:3] = (1.0 - share) * own + share * np.array(track.term.rgb) / 255.0
-                geom.rgba[3] *= GHOST_OPACITY if track.is_ghost else 1.0
-                if track.is_ghost:
+                share = GHOST_TINT if layer else TINT * (1.0 - KEPT_COLOUR * purity)
+                geom.rgba[:3] = (1.0 - share) * own + share * np.array(term.rgb) / 255.0
+                geom.rgba[3] *= GHOST_OPACITY if layer else 1.0
+                if layer:
                     geom.pos[:] -= layer * GHOST_SHIFT * self._film.camera.offset
 
     def _add_floor(self, target: Array) -> None:

@@ -34,12 +34,11 @@ from mjfim.output.report import Media, kinds_in, write_report
 from mjfim.output.video import report_video
 from mjfim.parallel.budget import current_interruption
 from mjfim.records.base import ShownRecord
-from mjfim.records.campaign import Campaign
 from mjfim.records.check import Check
 from mjfim.records.design import Design
 from mjfim.records.estimate import Estimate
 from mjfim.records.events import begin_stage
-from mjfim.records.studies import Comparison, MonteCarloStudy
+from mjfim.records.studies import Campaign, Comparison, MonteCarloStudy
 
 # Table of the drawn robots, and folder of their models.
 SAMPLES_TABLE = "samples.csv"

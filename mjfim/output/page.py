@@ -22,9 +22,10 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 from itertools import zip_longest
-from typing import Any, NamedTuple, Self
+from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
-from mjfim.records.verdict import Verdict
+if TYPE_CHECKING:
+    from mjfim.records.base import Verdict
 
 # Name of the report in a folder of results.
 REPORT = "report.html"

@@ -32,16 +32,16 @@ from mjfim.output.page import (
 from mjfim.output.pages import page_of
 from mjfim.output.panels import CELL_COLOURS, ROLES, Picture
 from mjfim.output.plots.pictures import kind_of_picture, pictures_of
-from mjfim.output.plots.plotly import Group, group_of
+from mjfim.output.plots.plotly import Plot as PanelPlot
+from mjfim.output.plots.plotly import plots_of
 from mjfim.output.video import Video
 from mjfim.records.base import ShownRecord
-from mjfim.records.campaign import Campaign
 from mjfim.records.check import Check
 from mjfim.records.design import Design
 from mjfim.records.estimate import Estimate
 from mjfim.records.rehearsal import Rehearsal
 from mjfim.records.robots import RobotComparison
-from mjfim.records.studies import Comparison, MonteCarloStudy
+from mjfim.records.studies import Campaign, Comparison, MonteCarloStudy
 from mjfim.records.worth import Watch, Worth
 
 if TYPE_CHECKING:
@@ -211,7 +211,7 @@ class Result(NamedTuple):
 
     page: Page
     name: str
-    groups: Mapping[str, Sequence[Group]]
+    pictures: Mapping[str, Sequence[tuple[Picture, Sequence[PanelPlot]]]]
     said: set[str]
 
 
@@ -305,22 +305,23 @@ def report_of(
         Result(
             page=page,
             name=names[i] if names else "",
-            groups={
-                part: [group_of(each, limit) for each in some] for part, some in drawn[i].items()
+            pictures={
+                part: [(each, plots_of(each, limit)) for each in some]
+                for part, some in drawn[i].items()
             },
             said={part.text for part in page.parts if isinstance(part, Text)},
         )
         for i, page in enumerate(pages)
     ]
-    plots = [
-        plot
+    panels = [
+        data
         for result in results
-        for some in result.groups.values()
-        for group in some
-        for plot in group.plots
+        for some in result.pictures.values()
+        for _, plots in some
+        for _, _, data in plots
     ]
-    number_of = {id(plot): i for i, plot in enumerate(plots)}
-    data = {"palettes": palettes(), "panels": [plot.data for plot in plots]}
+    number_of = {id(data): i for i, data in enumerate(panels)}
+    data = {"palettes": palettes(), "panels": panels}
     video = media.video
     html: str = template("report.html.j2").render(
         results=results,
@@ -328,7 +329,7 @@ def report_of(
         no_video=media.no_video,
         encoded="" if video is None else base64.b64encode(video.data).decode("ascii"),
         palettes=palettes(),
-        number_of=lambda plot: number_of[id(plot)],
+        number_of=lambda panel: number_of[id(panel)],
         data=htmlsafe_json_dumps(data, separators=(",", ":"), allow_nan=False),
         css=Markup(template("report.css").render()),
         js=Markup(template("report.js").render()),

@@ -4,18 +4,19 @@ from __future__ import annotations
 
 import io
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import zip_longest
+from typing import Any
 
 from rich.cells import cell_len
-from rich.console import Console, ConsoleOptions, RenderResult
+from rich.console import Console, Group
 from rich.padding import Padding
 from rich.segment import Segment
 from rich.style import Style
 from rich.text import Text as Styled
 
 from mjfim.output.page import Emphasis, Listing, Page, Row, Table, Text
-from mjfim.records.verdict import Level
+from mjfim.records.base import Level
 
 # Largest number of remarks of each weight that the short form shows.
 MOST = {"Fix first": 1, "Warning": 2, "Detail": 0}
@@ -45,53 +46,54 @@ STYLES = {
 VERDICT_STYLES = {Level.GOOD: "bold", Level.DOUBTFUL: "bold yellow", Level.BAD: "bold red"}
 
 
-@dataclass(frozen=True)
-class TerminalPage:
-    """A page as a Rich console prints it.
+def laid_out(
+    page: Page,
+    console: Console,
+    *,
+    verbose: bool = False,
+    more: str = "--verbose shows everything",
+) -> Group:
+    """Lay out a page for the width of the console that prints it.
 
-    Attributes:
+    Args:
         page: The page.
+        console: The console.
         verbose: True for all tables and sentences, False for a screen of text at most.
         more: What shows those that are left out.
     """
+    parts: list[Shown] = []
+    width, hidden = console.width, 0
+    for weight, sentences in page.remarks.items():
+        kept = sentences if verbose else sentences[: MOST[weight]]
+        emphasis = Emphasis.WARNING if MOST[weight] else Emphasis.WEAK
+        parts += (Text(f"{weight}: {sentence}", emphasis) for sentence in kept)
+        hidden += len(sentences) - len(kept)
+    parts += (part for part in page.parts if verbose or not part.detail)
+    parts += (Text(f"Next: {step}") for step in page.next_steps[:1])
+    verdict = page.verdict.sentence
+    if not verbose:
+        lines = MAX_LINES - _height(Text(verdict), width) - bool(hidden)
+        parts, left = _shortened(parts, width, lines)
+        hidden += left
 
-    page: Page
-    verbose: bool = False
-    more: str = "--verbose shows everything"
-
-    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-        """Lay out the page for the width of the terminal which shows it."""
-        page = self.page
-        verdict = page.verdict.sentence
-        if verdict:
-            yield _styled(verdict, VERDICT_STYLES[page.verdict.level])
-        parts: list[Shown] = []
-        width, hidden = options.max_width, 0
-        for weight, sentences in page.remarks.items():
-            kept = sentences if self.verbose else sentences[: MOST[weight]]
-            emphasis = Emphasis.WARNING if MOST[weight] else Emphasis.WEAK
-            parts += (Text(f"{weight}: {sentence}", emphasis) for sentence in kept)
-            hidden += len(sentences) - len(kept)
-        parts += (part for part in page.parts if self.verbose or not part.detail)
-        parts += (Text(f"Next: {step}") for step in page.next_steps[:1])
-        if not self.verbose:
-            lines = MAX_LINES - _height(Text(verdict), width) - bool(hidden)
-            parts, left = _shortened(parts, width, lines)
-            hidden += left
-        for part in parts:
-            if self.verbose and not isinstance(part, Text):
-                yield Styled()
-            yield from _rendered(part, width, console, verbose=self.verbose)
-        if hidden:
-            rows = "1 row or sentence" if hidden == 1 else f"{hidden} rows and sentences"
-            yield _styled(f"Not shown here: {rows}; {self.more}", "dim")
+    shown: list[Any] = []
+    if verdict:
+        shown.append(_styled(verdict, VERDICT_STYLES[page.verdict.level]))
+    for part in parts:
+        if verbose and not isinstance(part, Text):
+            shown.append(Styled())
+        shown += _rendered(part, width, console, verbose=verbose)
+    if hidden:
+        rows = "1 row or sentence" if hidden == 1 else f"{hidden} rows and sentences"
+        shown.append(_styled(f"Not shown here: {rows}; {more}", "dim"))
+    return Group(*shown)
 
 
 def text_of(page: Page, width: int = 80) -> str:
     """The short form of a page as plain text, for `print` in Python."""
     console = Console(width=width, file=io.StringIO(), force_jupyter=False, color_system=None)
     with console.capture() as captured:
-        console.print(TerminalPage(page, more="a notebook and the report show everything"))
+        console.print(laid_out(page, console, more="a notebook and the report show everything"))
     return "\n".join(line.rstrip() for line in captured.get().splitlines())
 
 

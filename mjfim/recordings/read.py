@@ -161,25 +161,12 @@ MIN_PERIOD = 1.2
 WINDOW_TOLERANCE = 1e-9
 
 
-@record
-class Log:
-    """A recording, and a summary of the log from which it was read.
-
-    Attributes:
-        recording: The recording, in SI units.
-        summary: Clock of the log, and the range of its columns.
-    """
-
-    recording: Recording
-    summary: LogSummary
-
-
 def read_recording(path: Path, channels: Channels) -> Recording:
     """Read a recording from a log of any format. See `read_log`."""
-    return read_log(path, channels).recording
+    return read_log(path, channels)[0]
 
 
-def read_log(path: Path, channels: Channels) -> Log:
+def read_log(path: Path, channels: Channels) -> tuple[Recording, LogSummary]:
     """Read a recording from a log of any format, and summarize the log.
 
     Args:
@@ -196,7 +183,7 @@ def read_log(path: Path, channels: Channels) -> Log:
     return log_of(read_columns(path, channels.spec), channels)
 
 
-def log_of(table: Table, channels: Channels) -> Log:
+def log_of(table: Table, channels: Channels) -> tuple[Recording, LogSummary]:
     """Make a recording of the columns of a log, and summarize the log. See `read_log`."""
     check_spec(channels)
     spec, path = channels.spec, table.source
@@ -238,7 +225,7 @@ def log_of(table: Table, channels: Channels) -> Log:
         outputs=measured,
         name=str(path),
     )
-    return Log(recording=recording, summary=summary)
+    return recording, summary
 
 
 def recording_paths(paths: Sequence[Path], channels: Channels) -> list[Path]:

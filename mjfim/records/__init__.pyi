@@ -1,9 +1,8 @@
-from .campaign import Campaign, CampaignStatus
 from .check import Check
 from .design import Design, Status
 from .estimate import Estimate
 from .rehearsal import FiniteSteps, Rehearsal
-from .studies import Comparison, MethodOutcome, MonteCarloStudy
+from .studies import Campaign, CampaignStatus, Comparison, MethodOutcome, MonteCarloStudy
 from .trajectory import Recording, Trajectory
 
 __all__ = [

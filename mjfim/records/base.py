@@ -1,5 +1,7 @@
 """Base classes of all records: read-only arrays, JSON from the fields, files without pickles.
 
+Results of verbs have a verdict, and results about parameters say what is known of each of them.
+
 Every result of the package is a record of `mjfim.records`, or of the module that computes it.
 """
 
@@ -7,28 +9,27 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import field, fields, is_dataclass
-from enum import Enum
+from enum import Enum, StrEnum
 from functools import cache
 from importlib import import_module
 from operator import attrgetter
 from pathlib import Path
 from reprlib import Repr
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar, NamedTuple, Self
 
 import numpy as np
 
-from mjfim.arrays import freeze
-from mjfim.errors import RecordingError, in_words
+from mjfim.arrays import NORMAL_95, Array, freeze, record
+from mjfim.errors import MjfimError, RecordingError, in_words, unknown
 from mjfim.files import read_arrays, write_arrays, write_json
-from mjfim.records.verdict import Verdict
 
 # Name of the text array in an npz file that holds all fields of a record that are not arrays.
 RECORD = "record"
 
 # Version of the files; another one is refused.
-VERSION = 3
+VERSION = 4
 
 # Largest number of characters of one value, and of entries of a sequence, in a short text.
 MAX_VALUE_LENGTH = 48
@@ -43,6 +44,7 @@ PAGES = "mjfim.output.pages"
 TERMINAL = "mjfim.output.terminal"
 PRESENTATION = "mjfim.output.report"
 PICTURES = "mjfim.output.plots.pictures"
+WORDS = "mjfim.output.words"
 
 
 def no_array(*shape: int) -> Any:
@@ -57,6 +59,36 @@ class NamedEnum(Enum):
     def _missing_(cls, value: object) -> Any:
         """The member with a name, as pydantic asks for it when it reads a file."""
         return cls.__members__.get(str(value))
+
+
+class Level(StrEnum):
+    """Quality of a result."""
+
+    GOOD = "good"
+    DOUBTFUL = "doubtful"
+    BAD = "bad"
+
+
+class Verdict(NamedTuple):
+    """What to think of a result, and what to do next.
+
+    Attributes:
+        sentence: The result in a sentence.
+        level: How good it is.
+        ok: Whether what was asked for was reached. The command line exits with 0 then, else with 1.
+        reasons: What is to be fixed first, and what limits the result.
+        next: What to do next, the most useful step first.
+    """
+
+    sentence: str
+    level: Level
+    ok: bool = False
+    reasons: tuple[str, ...] = ()
+    next: tuple[str, ...] = ()
+
+    def __str__(self) -> str:
+        next_step = [f"Next: {step}" for step in self.next[:1]]
+        return "\n".join([f"{self.level.upper()}: {self.sentence}", *self.reasons, *next_step])
 
 
 class Record:
@@ -235,6 +267,118 @@ class ShownRecord(SavedRecord):
         """Return the tables and sentences of the record as HTML, for notebooks."""
         html: str = import_module(PRESENTATION).as_html(self)
         return html
+
+
+@record
+class ParameterValue(Record):
+    """One parameter in a result; it prints as `0.203 ± 0.004 N m s/rad`, the 95 % interval.
+
+    Attributes:
+        name: Its name.
+        targets: The numbers of the model that it sets, such as `joint/a:damping`.
+        unit: Its unit; may be empty.
+        value: Its value: the estimate, or the guess at which σ was predicted [unit].
+        std: Standard deviation; infinite or NaN where the parameter is not determined [unit].
+        interval: Lower and upper end of the 95 % interval [unit].
+        further: Other numbers about it, which `table` shows.
+    """
+
+    name: str
+    targets: tuple[str, ...]
+    unit: str
+    value: float
+    std: float
+    interval: tuple[float, float]
+    further: dict[str, float] = field(default_factory=dict)
+
+    def __str__(self) -> str:
+        low, high = self.interval
+        text: str = import_module(WORDS).format_with_uncertainty(self.value, 0.5 * (high - low))
+        return f"{text} {self.unit}".rstrip()
+
+    __repr__ = __str__
+
+    def __float__(self) -> float:
+        return self.value
+
+
+class ParameterResult(ShownRecord):
+    """Base class of results about parameters.
+
+    `result["a"]` and `result["joint/a:damping"]` are the `ParameterValue` of a parameter, by its
+    name and by what it sets in the model.
+    """
+
+    def each(self) -> Iterator[ParameterValue]:
+        """What the result says about each parameter, in the order of the experiment."""
+        raise NotImplementedError
+
+    def __getitem__(self, key: str) -> ParameterValue:
+        known = {target: value for value in self.each() for target in value.targets}
+        known |= {value.name: value for value in self.each()}
+        if not isinstance(key, str) or key not in known:
+            raise MjfimError(unknown("parameter", key, known))
+        return known[key]
+
+    def table(self) -> Any:
+        """What the result says about each parameter, one row each [unit of the parameter].
+
+        Returns:
+            A pandas.DataFrame; a list of dictionaries where pandas is not installed.
+        """
+        rows = [
+            {
+                "parameter": each.name,
+                "target": ", ".join(each.targets),
+                "unit": each.unit,
+                "value": each.value,
+                "std": each.std,
+                "low": each.interval[0],
+                "high": each.interval[1],
+                **each.further,
+            }
+            for each in self.each()
+        ]
+        try:
+            pandas = import_module("pandas")
+        except ImportError:
+            return rows
+        return pandas.DataFrame(rows)
+
+
+def listed_values(
+    names: Sequence[str],
+    units: Sequence[str],
+    values: Array,
+    std: Array,
+    targets: Sequence[tuple[str, ...]] = (),
+    interval: Array | None = None,
+    **further: Array,
+) -> Iterator[ParameterValue]:
+    """Yield what columns say about p parameters.
+
+    Args:
+        names: Names of the parameters.
+        units: Their units.
+        values: (p,) their values.
+        std: (p,) their standard deviations.
+        targets: What each of them sets in the model; empty where it is not known.
+        interval: (p, 2) their 95 % intervals; default: those of a normal distribution.
+        **further: (p,) other numbers by their names.
+    """
+    if interval is None:
+        interval = np.asarray(values)[:, None] + np.outer(std, [-NORMAL_95, NORMAL_95])
+    for j, name in enumerate(names):
+        low, high = interval[j].tolist()
+        yield ParameterValue(
+            name=name,
+            targets=targets[j] if targets else (),
+            unit=units[j],
+            value=float(values[j]),
+            std=float(std[j]),
+            interval=(low, high),
+            further={key: float(column[j]) for key, column in further.items()},
+        )
 
 
 def _summary(value: Any) -> Any:

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
 
 from mjfim.arrays import NORMAL_95, Array, finite_or_nan, record
 from mjfim.errors import first_ones, shortened
-from mjfim.records.base import Record, no_array
+from mjfim.records.base import ParameterResult, ParameterValue, Record, no_array
 from mjfim.records.design import CombinationAccuracy, LimitViolation
 from mjfim.records.rehearsal import FiniteSteps, Rehearsal, Valley
-from mjfim.records.values import ParameterResult, ParameterValue
 from mjfim.records.worth import Worth
 
 # A coefficient that differs from 1 by less than this number is not written.
@@ -34,37 +33,22 @@ COMBINATIONS_TEXT = 180
 GROUPS_TEXT = 320
 
 
-@record
-class Combination(Record):
-    """An identifiable linear combination `sum_i coefficients_i * parameter_i`.
+# An identifiable linear combination: coefficients by the names of the parameters, the first one 1.
+Combination = dict[str, float]
 
-    Attributes:
-        members: Names of the parameters.
-        coefficients: Coefficient of each parameter; the first one is 1.
+
+def combination_terms(combination: Combination, name: Callable[[str], str] = str) -> list[str]:
+    """The terms of a combination in words, such as `m` and `+ 2 l`.
+
+    Args:
+        combination: The combination.
+        name: How a name is written.
     """
-
-    members: tuple[str, ...]
-    coefficients: tuple[float, ...]
-
-    def __str__(self) -> str:
-        return " ".join(self._terms(self.members))
-
-    @property
-    def short(self) -> str:
-        """The combination in a message; of many terms the first ones and the number of the others.
-
-        Very long names are shortened.
-        """
-        terms = self._terms([shortened(name) for name in self.members])
-        return first_ones(terms, " ", COMBINATION_TEXT)
-
-    def _terms(self, names: Sequence[str]) -> list[str]:
-        """Return the terms with given names of the members."""
-        terms = [names[0]]
-        for name, coefficient in zip(names[1:], self.coefficients[1:], strict=True):
-            sign = "+" if coefficient > 0 else "-"
-            terms.append(f"{sign} {_factor(abs(coefficient))}{name}")
-        return terms
+    terms: list[str] = []
+    for member, coefficient in combination.items():
+        sign = ("+ " if coefficient > 0 else "- ") if terms else ""
+        terms.append(f"{sign}{_factor(abs(coefficient))}{name(member)}")
+    return terms
 
 
 @record
@@ -80,20 +64,22 @@ class ParameterGroup(Record):
     members: tuple[str, ...]
     combinations: tuple[Combination, ...]
 
-    in_json = (
-        "members",
-        "words",
-    )
+    in_json = ("members", "words", "combinations")
+    json_names = {"combinations": "identifiable"}
 
     def __str__(self) -> str:
-        return self._sentence(join_names(self.members), ", ".join(map(str, self.combinations)))
+        combinations = [" ".join(combination_terms(each)) for each in self.combinations]
+        return self._sentence(join_names(self.members), ", ".join(combinations))
 
     @property
     def short(self) -> str:
         """The group in a message; of many names and terms the first ones are shown."""
         if len(str(self)) <= COMBINATIONS_TEXT:
             return str(self)
-        combinations = [combination.short for combination in self.combinations]
+        combinations = [
+            first_ones(combination_terms(each, shortened), " ", COMBINATION_TEXT)
+            for each in self.combinations
+        ]
         return self._sentence(self.short_names, first_ones(combinations, longest=COMBINATIONS_TEXT))
 
     def _sentence(self, names: str, combinations: str) -> str:
@@ -112,13 +98,6 @@ class ParameterGroup(Record):
             else first_ones([shortened(name) for name in self.members], longest=MEMBERS_TEXT)
         )
 
-    def summary(self) -> dict[str, Any]:
-        """The contents of the record in JSON."""
-        identifiable = [
-            dict(zip(c.members, c.coefficients, strict=True)) for c in self.combinations
-        ]
-        return {**super().summary(), "identifiable": identifiable}
-
 
 def combination_matrix(groups: Sequence[ParameterGroup], names: Sequence[str]) -> Array:
     """Return the coefficients of all combinations of several groups as a matrix.
@@ -135,7 +114,7 @@ def combination_matrix(groups: Sequence[ParameterGroup], names: Sequence[str]) -
 
     matrix = np.zeros((len(combinations), len(names)))
     for row, combination in zip(matrix, combinations, strict=True):
-        row[[column_of[member] for member in combination.members]] = combination.coefficients
+        row[[column_of[member] for member in combination]] = list(combination.values())
     return matrix
 
 
@@ -225,23 +204,6 @@ class ParameterCheck(Record):
 
 
 @record
-class ConfoundedPair(Record):
-    """Two parameters whose estimates are strongly correlated.
-
-    Attributes:
-        first: Name of one parameter.
-        second: Name of the other one.
-        correlation: Correlation of their estimates, -1 to 1.
-    """
-
-    first: str
-    second: str
-    correlation: float
-
-    json_names = {"first": "a", "second": "b"}
-
-
-@record
 class SelfTest(Record):
     """Test of the derivatives along a trajectory.
 
@@ -290,7 +252,6 @@ class Check(ParameterResult):
         eigenvalues: (s,) ascending eigenvalues of the information that the criterion uses.
         correlation: (t, t) correlation of the estimates of `wanted`; NaN where a parameter is not
             identifiable alone.
-        confounded: Pairs of parameters with strongly correlated estimates.
         not_separable: Groups of parameters that no experiment with these outputs can separate.
         not_excited: Groups of parameters that another control would separate.
         self_test: Test of the derivatives.
@@ -318,7 +279,6 @@ class Check(ParameterResult):
     information: Array
     eigenvalues: Array
     correlation: Array
-    confounded: tuple[ConfoundedPair, ...]
     not_separable: tuple[ParameterGroup, ...]
     not_excited: tuple[ParameterGroup, ...]
     self_test: SelfTest
@@ -397,6 +357,16 @@ class Check(ParameterResult):
         return self.correlation * np.outer(std, std)
 
     @property
+    def confounded(self) -> list[tuple[str, str, float]]:
+        """Pairs of parameters with strongly correlated estimates, and their correlation."""
+        is_strong = np.triu(np.abs(self.correlation) > CONFOUNDED_CORRELATION, k=1)
+        pairs = [
+            (self.wanted[i], self.wanted[j], float(self.correlation[i, j]))
+            for i, j in np.argwhere(is_strong).tolist()
+        ]
+        return sorted(pairs, key=lambda pair: -abs(pair[2]))
+
+    @property
     def is_dangerous(self) -> bool:
         """True if nobody would play the motion, and, for a start, no limit turns a design away."""
         if self.rehearsal is None:
@@ -417,6 +387,10 @@ class Check(ParameterResult):
             **super().summary(),
             "complete": not self.missing,
             "combined": combined,
+            "confounded": [
+                {"a": first, "b": second, "correlation": correlation}
+                for first, second, correlation in self.confounded
+            ],
         }
 
 
@@ -442,8 +416,8 @@ def findings_of_check(check: Check) -> Iterator[str]:
     yield from _about_accuracy(check, identifiable)
     if check.confounded:
         pairs = [
-            f"{shortened(pair.first)} / {shortened(pair.second)} ({pair.correlation:+.3f})"
-            for pair in check.confounded
+            f"{shortened(first)} / {shortened(second)} ({correlation:+.3f})"
+            for first, second, correlation in check.confounded
         ]
         yield (
             f"confounded pairs (correlation of the estimates): {first_ones(pairs)}; "

@@ -10,10 +10,18 @@ import numpy as np
 
 from mjfim.arrays import Array, finite_or_nan, record, scaled_pseudo_inverse
 from mjfim.errors import MjfimError
-from mjfim.records.base import NamedEnum, Record, SavedRecord, ShownRecord, no_array
+from mjfim.records.base import (
+    NamedEnum,
+    ParameterResult,
+    ParameterValue,
+    Record,
+    SavedRecord,
+    ShownRecord,
+    listed_values,
+    no_array,
+)
 from mjfim.records.rehearsal import Rehearsal, Valley
 from mjfim.records.trajectory import Labels, Trajectory
-from mjfim.records.values import ParameterResult, ParameterValue, listed_values
 from mjfim.records.worth import Worth
 
 # Relative difference of two costs J, or of two σ, below which they count as equal.

@@ -14,7 +14,14 @@ import numpy as np
 from mjfim.arrays import NORMAL_95, Array, record
 from mjfim.errors import RecordingError, first_ones
 from mjfim.files import read_json
-from mjfim.records.base import Record, SavedRecord, no_array
+from mjfim.records.base import (
+    ParameterResult,
+    ParameterValue,
+    Record,
+    SavedRecord,
+    listed_values,
+    no_array,
+)
 from mjfim.records.check import Check, join_names
 from mjfim.records.design import Design
 from mjfim.records.estimate_parts import (
@@ -26,7 +33,6 @@ from mjfim.records.estimate_parts import (
 from mjfim.records.robots import RecordingComparison
 from mjfim.records.terms import Selection, Term, TermTestData
 from mjfim.records.trajectory import Labels, Recording, Trajectory
-from mjfim.records.values import ParameterResult, ParameterValue, listed_values
 
 # Module that writes identified models; records must not depend on the output.
 MODELS = "mjfim.output.export.mjcf"

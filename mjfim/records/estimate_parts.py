@@ -8,9 +8,8 @@ from typing import Any
 import numpy as np
 
 from mjfim.arrays import Array, record
-from mjfim.records.base import Record, no_array
+from mjfim.records.base import ParameterResult, ParameterValue, Record, listed_values, no_array
 from mjfim.records.check import join_names
-from mjfim.records.values import ParameterResult, ParameterValue, listed_values
 
 
 @record

@@ -6,9 +6,10 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
-from mjfim.arrays import record
+from mjfim.arrays import Array, record
 from mjfim.records.base import Record
 from mjfim.records.estimate import ControlLawInLoop
+from mjfim.records.rehearsal import LimitRange
 
 # Kinds of entries, the names of the fields of `Inventory` that hold them, and what names an entry.
 KINDS = {
@@ -86,30 +87,6 @@ class ListedKeyframe(Record):
 
 
 @record
-class ListedLimit(Record):
-    """A range of the MJCF or a stated limit, which a design keeps.
-
-    Attributes:
-        quantity: What is limited: `position`, `control`, `force` or `joint_force`.
-        name: Name of the joint or the actuator.
-        lower: Lower bound [unit].
-        upper: Upper bound [unit].
-        unit: Unit of the bounds; empty where it is not evident from the model.
-    """
-
-    quantity: str
-    name: str
-    lower: float
-    upper: float
-    unit: str
-
-    @property
-    def path(self) -> str:
-        """Name of the limit in a list."""
-        return f"{self.quantity}/{self.name}"
-
-
-@record
 class ListedTerm(Record):
     """A kind of physical term that an experiment file can add to the model.
 
@@ -147,7 +124,7 @@ class Inventory(Record):
     outputs: tuple[ListedOutput, ...]
     actuators: tuple[ListedActuator, ...]
     keyframes: tuple[ListedKeyframe, ...]
-    limits: tuple[ListedLimit, ...]
+    limits: tuple[LimitRange, ...]
     terms: tuple[ListedTerm, ...]
     remarks: tuple[str, ...]
 
@@ -185,42 +162,6 @@ class Inventory(Record):
 
 
 @record
-class StatedParameter(Record):
-    """One unknown parameter.
-
-    Attributes:
-        name: Name of the parameter.
-        unit: Its unit; may be empty.
-        guess: Value for which designs are made [unit].
-        lower: Lower bound of the estimate, -inf without one [unit].
-        upper: Upper bound of the estimate, inf without one [unit].
-        nuisance: True where its accuracy is not optimised.
-    """
-
-    name: str
-    unit: str
-    guess: float
-    lower: float
-    upper: float
-    nuisance: bool
-
-
-@record
-class StatedOutput(Record):
-    """One measured output.
-
-    Attributes:
-        name: Column of recordings.
-        unit: Its unit; may be empty.
-        sigma: Standard deviation of its noise [unit].
-    """
-
-    name: str
-    unit: str
-    sigma: float
-
-
-@record
 class StatedExperiment(Record):
     """Contents of a correct experiment file.
 
@@ -229,8 +170,14 @@ class StatedExperiment(Record):
         model: Path of the model file.
         rate: Rate of the samples [Hz].
         horizon: Duration of a designed experiment [s]; None where it is not stated.
-        parameters: The unknown parameters.
-        outputs: The measured outputs.
+        parameters: Names of the p unknown parameters.
+        units: Their units; may be empty.
+        guess: (p,) values for which designs are made [theta-unit].
+        bounds: (p, 2) lower and upper bounds of the estimates, infinite without one [theta-unit].
+        nuisance: Names of the parameters whose accuracy is not optimised.
+        sigma: Standard deviation of the noise of each measured output, a column of recordings
+            [unit of the output].
+        output_units: Units of the outputs by their names; may be empty.
         controls: Names of the controls.
         limits: The limits of a design, the ranges of the MJCF among them.
         controllers: The control laws, at the guess.
@@ -242,10 +189,50 @@ class StatedExperiment(Record):
     model: str
     rate: float
     horizon: float | None
-    parameters: tuple[StatedParameter, ...]
-    outputs: tuple[StatedOutput, ...]
+    parameters: tuple[str, ...]
+    units: tuple[str, ...]
+    guess: Array
+    bounds: Array
+    nuisance: tuple[str, ...]
+    sigma: dict[str, float]
+    output_units: dict[str, str]
     controls: tuple[str, ...]
-    limits: tuple[ListedLimit, ...]
+    limits: tuple[LimitRange, ...]
     controllers: tuple[ControlLawInLoop, ...]
     missing: tuple[str, ...]
     warnings: tuple[str, ...]
+
+    in_json = (
+        "source",
+        "model",
+        "rate",
+        "horizon",
+        "parameters",
+        "outputs",
+        "controls",
+        "limits",
+        "controllers",
+        "missing",
+        "warnings",
+    )
+
+    @property
+    def outputs(self) -> tuple[str, ...]:
+        """Names of the measured outputs."""
+        return tuple(self.sigma)
+
+    def summary(self) -> dict[str, Any]:
+        """The contents of the record in JSON, with a row for each parameter and output."""
+        names = ("name", "unit", "guess", "lower", "upper", "nuisance")
+        columns = (self.units, self.guess.tolist(), *self.bounds.T.tolist())
+        return {
+            **super().summary(),
+            "parameters": [
+                dict(zip(names, (*row, row[0] in self.nuisance), strict=True))
+                for row in zip(self.parameters, *columns, strict=True)
+            ],
+            "outputs": [
+                {"name": name, "unit": self.output_units[name], "sigma": sigma}
+                for name, sigma in self.sigma.items()
+            ],
+        }

@@ -14,7 +14,7 @@ import numpy as np
 
 from mjfim.arrays import NORMAL_95, Array, record
 from mjfim.errors import first_ones, shortened
-from mjfim.records.base import Record, ShownRecord
+from mjfim.records.base import Record, ShownRecord, no_array
 
 # Ratios of the effect of a finite step to that of the derivatives that confirm a standard
 # deviation.
@@ -210,24 +210,32 @@ class Valley(Record):
 
 
 @record
-class RehearsedLimit(Record):
-    """A limit whose margin is measured on every robot.
+class LimitRange(Record):
+    """A limit: a range of the MJCF, a stated one, or one whose margin is measured on robots.
 
     Attributes:
         kind: Kind of the limit, such as `position`, `control_rate` or `clearance`.
         name: Name of the joint or actuator; "nearest pair" for a clearance.
         lower: Lower bound [unit of the quantity].
         upper: Upper bound [unit of the quantity].
-        scale: Half of the range, by which margins are divided [unit of the quantity].
         unit: Unit of the quantity; empty where it is unknown.
+        scale: Half of the range, by which margins are divided [unit of the quantity].
     """
 
     kind: str
     name: str
     lower: float
     upper: float
-    scale: float
     unit: str = ""
+    scale: float = 1.0
+
+    in_json = ("kind", "name", "lower", "upper", "unit")
+    json_names = {"kind": "quantity"}
+
+    @property
+    def path(self) -> str:
+        """Name of the limit in a list."""
+        return f"{self.kind}/{self.name}"
 
 
 @record
@@ -244,7 +252,7 @@ class Fan(Record):
             unknown.
     """
 
-    limit: RehearsedLimit
+    limit: LimitRange
     t: Array
     model: Array
     worst: Array
@@ -262,21 +270,6 @@ class Fan(Record):
     def spread_after(self) -> float:
         """The same after the experiment."""
         return 0.5 * float((self.after[1] - self.after[0]).max())
-
-
-@record
-class RobotMotions(Record):
-    """Motions of g robots at n instants, to be drawn beside that of the model.
-
-    Attributes:
-        robots: Rows of these robots in the arrays of a rehearsal, the least safe one first.
-        t: (n,) times [s].
-        qpos: (g, n, nq) positions [m or rad; unit quaternions for ball and free joints].
-    """
-
-    robots: tuple[int, ...]
-    t: Array
-    qpos: Array
 
 
 @record
@@ -323,7 +316,9 @@ class Rehearsal(ShownRecord):
             NaN where it is safe anyway, or with none of them; None where none was tried.
         safe_with_feedback: Whether feedback makes this motion safe; None where it was not tried.
         fans: Spread of the motions, for the quantities that come closest to their limits.
-        motions: Motions of some of the robots; None without robots.
+        motion_times: (k,) times of the motions that are drawn [s].
+        motions: (k, nq) positions of some robots by their rows in the arrays, the least safe one
+            first [m or rad; unit quaternions for ball and free joints].
     """
 
     parameters: tuple[str, ...]
@@ -331,7 +326,7 @@ class Rehearsal(ShownRecord):
     feedback: bool
     latency: float
     theta: Array
-    limits: tuple[RehearsedLimit, ...]
+    limits: tuple[LimitRange, ...]
     margins: Array
     joints: tuple[str, ...]
     units: tuple[str, ...]
@@ -357,7 +352,8 @@ class Rehearsal(ShownRecord):
     safe_wrong: float | None = None
     safe_with_feedback: bool | None = None
     fans: tuple[Fan, ...] = ()
-    motions: RobotMotions | None = None
+    motion_times: Array = no_array()
+    motions: dict[int, Array] = field(default_factory=dict)
 
     file_stem = "rehearsal"
     made_by = "`mjfim rehearse DESIGN_FOLDER -o DIR`"

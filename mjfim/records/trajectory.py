@@ -221,25 +221,3 @@ class Recording(SavedRecord):
             "rows": len(self.t),
             "nu": self.ctrl.shape[1],
         }
-
-
-@record
-class Playback(Record):
-    """A design as a controller plays it: M rows at the controller's rate, and the final state.
-
-    Attributes:
-        t: (M+1,) times [s].
-        state: (M+1, nq+nv+na) planned positions, velocities and activations.
-        ctrl: (M, nu) controls, held over each row [unit of the actuator].
-        gain: (M, nu, nx) feedback gains K, held over each sample of the design [u-unit / x-unit].
-    """
-
-    t: Array
-    state: Array
-    ctrl: Array
-    gain: Array
-
-    @property
-    def period(self) -> float:
-        """Sample period of the controller [s]."""
-        return float(self.t[-1] - self.t[0]) / len(self.ctrl)

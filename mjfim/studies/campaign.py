@@ -43,10 +43,10 @@ from mjfim.identification.identify import identify_system
 from mjfim.model.parameters import Parameter
 from mjfim.parallel import ExecutorLike, Workers
 from mjfim.parallel.budget import StopToken, stop_on_interrupt
-from mjfim.records.campaign import Campaign, CampaignStatus, EarlierRound, Round
 from mjfim.records.design import Design, Status
 from mjfim.records.estimate import Estimate
 from mjfim.records.events import Callback, StudyEvent, shown_progress
+from mjfim.records.studies import Campaign, CampaignStatus, EarlierRound, Round
 from mjfim.records.trajectory import Recording
 
 # Smallest distance of guesses from bounds, relative to the size of a parameter.

@@ -43,7 +43,7 @@ from mjfim.experiment.given import RecordingsLike, TrajectoryLike, recordings_of
 from mjfim.experiment.initial import multisine
 from mjfim.experiment.schema import ExperimentLike
 from mjfim.experiment.stated_units import probable_degrees
-from mjfim.experiment.system import System, SystemOrder
+from mjfim.experiment.system import System, SystemOrder, order_of
 from mjfim.identification.fit_problem import FitProblem, sensitivity_rows
 from mjfim.identification.fit_workers import FitWorkers
 from mjfim.identification.search import refuse_same_data
@@ -60,9 +60,7 @@ from mjfim.parallel.budget import Budget, StopToken, stop_on_interrupt
 from mjfim.plant.active_constraints import first_active_constraint
 from mjfim.plant.mixed_derivatives import CENTRAL_DIFFERENCES
 from mjfim.records.check import (
-    CONFOUNDED_CORRELATION,
     Check,
-    ConfoundedPair,
     ParameterCheck,
     SelfTest,
     findings_of_check,
@@ -438,7 +436,7 @@ def _identifiability_test(
 
     def make(threads: int) -> Callable[[], IdentifiabilityTest]:
         """Return what makes the test in a worker."""
-        return partial(_made_test, SystemOrder.of(task.system, threads), test.theta, test.earlier)
+        return partial(_made_test, order_of(task.system, threads), test.theta, test.earlier)
 
     def differentiated(probes: Iterable[Trajectory]) -> Iterator[RowsAndError | None]:
         """Differentiate motions on the workers."""
@@ -447,9 +445,9 @@ def _identifiability_test(
     return replace(test, differentiated=differentiated)
 
 
-def _made_test(system: SystemOrder, theta: Array, earlier: Array) -> IdentifiabilityTest:
+def _made_test(order: SystemOrder, theta: Array, earlier: Array) -> IdentifiabilityTest:
     """Make a test in a worker, which has no random motions of its own."""
-    made = system.system()
+    made = order()
     return IdentifiabilityTest(
         plant=made.plant,
         parameters=made.parameters,
@@ -570,12 +568,6 @@ def _checked(
     groups = found.groups_along_trajectory if here.count > everywhere.count else ()
     not_excited = tuple(group for group in groups if str(group) not in never)
     values = task.theta[task.parameters.interest]
-    pairs = [
-        ConfoundedPair(
-            first=found.names[i], second=found.names[j], correlation=float(correlation[i, j])
-        )
-        for i, j in np.argwhere(np.triu(np.abs(correlation) > CONFOUNDED_CORRELATION, k=1)).tolist()
-    ]
 
     check = Check(
         source=source,
@@ -585,7 +577,6 @@ def _checked(
         information=total,
         eigenvalues=np.maximum(eigenvalues, 0.0),
         correlation=correlation,
-        confounded=tuple(sorted(pairs, key=lambda pair: -abs(pair.correlation))),
         not_separable=found.groups_along_all,
         not_excited=not_excited,
         self_test=tested,

@@ -27,14 +27,12 @@ from mjfim.records.inventory import (
     Inventory,
     ListedActuator,
     ListedKeyframe,
-    ListedLimit,
     ListedOutput,
     ListedParameter,
     ListedTerm,
     StatedExperiment,
-    StatedOutput,
-    StatedParameter,
 )
+from mjfim.records.rehearsal import LimitRange
 
 # Name of a term that no model has, and timesteps of a sample, for terms that are only listed.
 FREE_NAME = "?"
@@ -123,10 +121,10 @@ def _actuators(source: ModelSource) -> Iterator[ListedActuator]:
         yield ListedActuator(name=control, drives=drives, unit=control_unit(model, i))
 
 
-def _listed(limit: Limit) -> ListedLimit:
+def _listed(limit: Limit) -> LimitRange:
     """A limit for the user."""
-    return ListedLimit(
-        quantity=limit.kind,
+    return LimitRange(
+        kind=limit.kind,
         name=limit.name,
         lower=limit.lower,
         upper=limit.upper,
@@ -195,26 +193,19 @@ def stated_experiment(experiment: Experiment) -> StatedExperiment:
     else:
         limits = DesignTask.of(system).limits
 
+    parameters, outputs = system.parameters, system.outputs.outputs
     return StatedExperiment(
         source=experiment.source,
         model=str(system.model_path),
         rate=experiment.rate,
         horizon=experiment.horizon,
-        parameters=tuple(
-            StatedParameter(
-                name=parameter.name,
-                unit=parameter.unit,
-                guess=parameter.guess,
-                lower=parameter.bounds[0],
-                upper=parameter.bounds[1],
-                nuisance=parameter.nuisance,
-            )
-            for parameter in system.parameters.parameters
-        ),
-        outputs=tuple(
-            StatedOutput(name=output.name, unit=output.unit, sigma=output.sigma)
-            for output in system.outputs.outputs
-        ),
+        parameters=parameters.names,
+        units=system.units,
+        guess=parameters.guess,
+        bounds=np.column_stack([parameters.lower, parameters.upper]),
+        nuisance=tuple(each.name for each in parameters.parameters if each.nuisance),
+        sigma={output.name: output.sigma for output in outputs},
+        output_units={output.name: output.unit for output in outputs},
         controls=system.controls,
         limits=tuple(map(_listed, limits)),
         controllers=laws_in_loop(system, system.parameters.guess, {}),

@@ -20,7 +20,7 @@ from mjfim.excitation.evaluation import motion_of
 from mjfim.experiment.arguments import checked
 from mjfim.experiment.given import TrajectoryLike
 from mjfim.experiment.schema import ExperimentLike, experiment_of
-from mjfim.experiment.system import System, SystemOrder, labels_of_system
+from mjfim.experiment.system import System, SystemOrder, labels_of_system, order_of
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.identify import least_squares
 from mjfim.information.identifiability import require_visible
@@ -304,7 +304,7 @@ def _estimates(
         rng.standard_normal((count, len(trial_set.exact)))  # the numbers of this chunk
 
     def make(threads: int) -> Callable[[], TrialSet]:
-        return partial(_made_trials, SystemOrder.of(trial_set.system, threads), trial_set.ctrl)
+        return partial(_made_trials, order_of(trial_set.system, threads), trial_set.ctrl)
 
     budget = Budget(stop=stop)
     every = results_on(trial_set, make, _estimated, chunks, executor, budget)
@@ -314,8 +314,8 @@ def _estimates(
             yield found
 
 
-def _made_trials(system: SystemOrder, ctrl: Array) -> TrialSet:
-    return TrialSet.of(system.system(), ctrl)
+def _made_trials(order: SystemOrder, ctrl: Array) -> TrialSet:
+    return TrialSet.of(order(), ctrl)
 
 
 def _estimated(trial_set: TrialSet, chunk: tuple[int, Any], stop: StopToken) -> Array | None:

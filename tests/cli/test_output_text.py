@@ -13,7 +13,7 @@ import pytest
 from mjfim.cli import main as cli
 from mjfim.cli.progress import errors, lose_what_cannot_be_written, out
 from mjfim.output.page import Row, Table
-from mjfim.output.terminal import TerminalPage
+from mjfim.output.terminal import laid_out
 from tests.support.cli import MODELS, PROCESS, done, names, read, write_experiment
 from tests.support.pages import page_with
 from tests.support.paths import ROOT
@@ -34,7 +34,7 @@ def test_brackets_in_tables(capsys: pytest.CaptureFixture[str]) -> None:
     shown = ("title [/a]", "heading [b]", NAME, "note [/c]")
     title, heading, cell, note = shown
     table = Table(title=title, columns=(heading,), rows=(Row((cell,)),), note=note)
-    out.print(TerminalPage(page_with(table)))
+    out.print(laid_out(page_with(table), out))
     printed = capsys.readouterr().out
     assert [text for text in shown if text not in printed] == []
 

@@ -24,9 +24,9 @@ from mjfim.output.folders import find_experiment_file
 from mjfim.output.pages import page_of
 from mjfim.output.plots.studies import fan_panels
 from mjfim.output.words import format_number
+from mjfim.records.base import Level
 from mjfim.records.design import Design, keeps_limits
 from mjfim.records.rehearsal import FiniteSteps
-from mjfim.records.verdict import Level
 from tests.support.cli import run
 from tests.support.limits import played
 from tests.support.paths import MODELS
@@ -167,6 +167,7 @@ def test_fans_are_quantiles_of_plain_loops(plain: Played) -> None:
     """The band, the model, the robot that comes closest to a limit, and the kept motions."""
     _, design, states = plain
     fans, motions = design.rehearsal.fans, design.rehearsal.motions
+    times = design.rehearsal.motion_times
     assert {(fan.limit.kind, fan.limit.name) for fan in fans} == set(PLACES)
     for fan in fans:
         rows = np.rint(fan.t / 0.005).astype(int)
@@ -182,10 +183,10 @@ def test_fans_are_quantiles_of_plain_loops(plain: Played) -> None:
         ):
             assert_allclose(found, wanted, rtol=1e-6, atol=1e-6)
         assert fan.spread_before == pytest.approx(0.5 * np.ptp(band, axis=0).max(), rel=1e-5)
-    rows = np.rint(motions.t / 0.005).astype(int)
-    robots = np.array(motions.robots)
-    assert_allclose(motions.qpos, states[robots][:, rows, :2], rtol=1e-6, atol=1e-7)
-    assert len(set(motions.robots)) == 8 and min(motions.robots) > 0
+    rows = np.rint(times / 0.005).astype(int)
+    robots, qpos = list(motions), np.array([*motions.values()])
+    assert_allclose(qpos, states[robots][:, rows, :2], rtol=1e-6, atol=1e-7)
+    assert len(robots) == 8 and min(robots) > 0
 
 
 @pytest.mark.slow

@@ -13,7 +13,7 @@ from numpy.testing import assert_allclose
 
 import mjfim
 from mjfim.experiment.given import recordings_of
-from mjfim.experiment.sysid import parameter_tables
+from mjfim.experiment.schema import parameter_tables
 from mjfim.experiment.system import System
 from mjfim.output.export.sysid import export_sysid, silenced
 from tests.support import cart_pendulum

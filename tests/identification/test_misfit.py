@@ -20,8 +20,8 @@ from mjfim.identification.assessment.residual_tests import (
     worst_residual,
 )
 from mjfim.output.pages.estimate import estimate_page
+from mjfim.records.base import Level
 from mjfim.records.estimate import Whiteness, WorstResidual
-from mjfim.records.verdict import Level
 from tests.support.cart_pendulum import cart_pendulum
 from tests.support.numerics import Array
 from tests.support.terms import recorded

@@ -56,7 +56,7 @@ def test_the_table_holds_the_plan_and_the_gains(kind: str, tmp_path: Path) -> No
     task = BUILD[kind](tmp_path, playback_rate=FINE[kind])
     path, K = tmp_path / "design.csv", gains(task)
     played = simulate_playback(task.system, task.initial, K)
-    archive.write_table(path, design_columns(played, task.system))
+    archive.write_table(path, design_columns(*played, task.system))
     model = mujoco.MjModel.from_xml_path(str(tmp_path / "model.xml"))
     data, layout, rows = mujoco.MjData(model), Layout(model), read_rows(path)
     times = np.array([row["t"] for row in rows])
@@ -83,7 +83,7 @@ def test_reference_agrees_with_mujoco(kind: str, tmp_path: Path) -> None:
     those of mj_forward; no field is empty.
     """
     task = BUILD[kind](tmp_path, playback_rate=FINE[kind])
-    played = simulate_playback(task.system, task.initial, gains(task))
+    played, _ = simulate_playback(task.system, task.initial, gains(task))
     archive.write_table(tmp_path / "reference.csv", reference_columns(played, task.system))
     rows = table(tmp_path / "reference.csv")
     assert all(np.isfinite(values).all() for values in rows.values())

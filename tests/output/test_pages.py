@@ -18,12 +18,12 @@ from mjfim.output.page import Emphasis, Listing, Row, Table, named, number
 from mjfim.output.pages import page_of
 from mjfim.output.pages.estimate import selection_parts
 from mjfim.output.rerun.documents import as_markdown
-from mjfim.output.terminal import TerminalPage
+from mjfim.output.terminal import laid_out
 from mjfim.output.words import improvement, relative
-from mjfim.records.base import ShownRecord
-from mjfim.records.campaign import CampaignStatus
+from mjfim.records.base import Level, ShownRecord, Verdict
 from mjfim.records.check import findings_of_check
 from mjfim.records.design import CombinationAccuracy, LimitViolation, ScaledStart, Status
+from mjfim.records.studies import CampaignStatus
 from mjfim.records.terms import (
     AlternativeTerm,
     Decision,
@@ -32,7 +32,6 @@ from mjfim.records.terms import (
     Term,
     TermTestData,
 )
-from mjfim.records.verdict import Level, Verdict
 from mjfim.studies.selected_models import possible_pools, selected_experiment
 from tests.support import results
 from tests.support.pages import page_with, printed, sentences
@@ -348,5 +347,5 @@ def test_the_level_of_a_verdict_has_a_colour() -> None:
         page = replace(page_with(), verdict=Verdict("Done.", level))
         console = Console(force_terminal=True, color_system="standard", width=80)
         with console.capture() as capture:
-            console.print(TerminalPage(page))
+            console.print(laid_out(page, console))
         assert f"\x1b[{code}mDone." in capture.get()

@@ -32,7 +32,7 @@ from mjfim.output.panels import (
     vline,
 )
 from mjfim.output.plots.pictures import pictures_of
-from mjfim.output.plots.plotly import group_of, packed, thinned
+from mjfim.output.plots.plotly import packed, plots_of, thinned
 from mjfim.output.report import KINDS, Media, media_in, report_of, write_report
 from mjfim.output.video import Video
 from mjfim.records.base import ShownRecord
@@ -160,27 +160,26 @@ def test_marks_become_traces_and_shapes() -> None:
     panel = Panel(marks=MARKS, x=Axis(label="time [s]", log=True, limits=(0.1, 10.0)))
     lower = replace(panel, x=Axis(label="time [s]"), place=(1, 0))
     picture = Picture(title="T", panels=[replace(panel, x=Axis()), lower], heights=(1.0, 5.0))
-    group = group_of(picture, 1000)
-    assert [(key.name, key.shape) for key in group.keys] == [
+    assert [(key.label, key.kind) for key in picture.legend()] == [
         ("curve", "line"),
-        ("bars", "bar"),
-        ("strip", "band"),
+        ("bars", "bars"),
+        ("strip", "hspan"),
     ]
-    curve, held, marks, bar = group.plots[0].data["traces"]
+    first, second = (data for _, _, data in plots_of(picture, 1000))
+    curve, held, marks, bar = first["traces"]
     assert curve["line"]["dash"] == "dash" and curve["line"]["color"] == "role:measured"
     assert held["line"]["shape"] == "hv" and numbers(held["y"]).tolist() == [5.0, 6.0, 6.0]
     assert marks["text"] == ["&lt;odd&gt;"]
     assert (bar["base"], numbers(bar["x"])[0]) == ([1.0], 2.0)
-    upright, strip = group.plots[0].data["layout"]["shapes"]
+    upright, strip = first["layout"]["shapes"]
     assert (upright["x0"], upright["yref"]) == (2.0, "y domain")
     assert (strip["y0"], strip["y1"]) == (-1.0, 1.0)
     # Plots above each other share the name of their axis, and their range when one is zoomed.
-    layouts = [plot.data["layout"] for plot in group.plots]
-    assert layouts[0]["xaxis"]["title"]["text"] == "time [s]"
-    assert group.plots[0].data["linked"] == group.plots[1].data["linked"] != ""
-    assert group.plots[1].height == 500
-    (alone,) = group_of(Picture(title="", panels=[panel]), 9).plots
-    assert alone.data["layout"]["xaxis"]["range"] == [-1.0, 1.0]
+    assert first["layout"]["xaxis"]["title"]["text"] == "time [s]"
+    assert first["linked"] == second["linked"] != ""
+    assert second["height"] == 500
+    ((_, is_wide, alone),) = plots_of(Picture(title="", panels=[panel]), 9)
+    assert is_wide and alone["layout"]["xaxis"]["range"] == [-1.0, 1.0]
 
 
 def test_cells_and_words_beside_rows() -> None:
@@ -188,11 +187,11 @@ def test_cells_and_words_beside_rows() -> None:
     cells = Cells(values=values, middle=1.0, texts=[["a", "b"]] * 2, edges=edges)
     names = row_axis(["x" * 40, "y"])
     panel = Panel(cells=cells, x=names, beside=[("head", "muted", ["one", "two"])], message="m")
-    (plot,) = group_of(Picture(title="", panels=[panel]), 9).plots
-    (heatmap,) = plot.data["traces"]
+    ((_, _, plot),) = plots_of(Picture(title="", panels=[panel]), 9)
+    (heatmap,) = plot["traces"]
     assert heatmap["x"] == [0.0, 1.5, 3.0]
     assert heatmap["z"] == [[0.0, None], [1.0, 2.0]] and heatmap["text"][0] == ["a", "b"]
-    layout = plot.data["layout"]
+    layout = plot["layout"]
     assert [each["text"] for each in layout["annotations"]] == ["head", "one", "two", "m"]
     assert len(layout["yaxis"]["ticktext"][0]) < 30 and layout["margin"]["r"] > 30
 

@@ -31,7 +31,6 @@ from mjfim.output.rerun.camera import (
 from mjfim.output.rerun.scene import INFINITE_REACH, OUTLINE, SOLID, body_poses, entity_path
 from mjfim.records.design import Design
 from mjfim.records.estimate import Estimate, Prediction, PredictionErrors
-from mjfim.records.rehearsal import RobotMotions
 from tests.support import results
 from tests.support.made_motions import designed, estimated, load, simulated
 from tests.support.rrd import Recorded
@@ -216,15 +215,15 @@ def test_ends_of_rehearsed_robots_are_those_of_mujoco(
     """Two robots, of which one leaves a limit; the bands are series."""
     t = np.linspace(0.0, 2.0, 30)
     swing = np.column_stack([np.sin(t), np.cos(t)])
-    motions = RobotMotions(robots=(7, 2), t=t, qpos=np.stack([0.3 * swing, 0.6 * swing]))
+    motions = {7: 0.3 * swing, 2: 0.6 * swing}
     std = np.array([0.1, 0.2])
     steps = replace(results.finite_steps(predicted=std), names=design.parameters)
     kept = results.rehearsal(steps=steps)
     margins = kept.margins.copy()
     margins[7] = -0.1
-    rehearsal = replace(kept, margins=margins, motions=motions)
+    rehearsal = replace(kept, margins=margins, motion_times=t, motions=motions)
     made = logged(tmp_path, cart, replace(design, rehearsal=rehearsal))
-    for positions, name in zip(motions.qpos, ("a limit", "no limit"), strict=True):
+    for positions, name in zip(motions.values(), ("a limit", "no limit"), strict=True):
         expected = plain_poses(cart, positions)[2][:, -1]
         at = ("robots", "designed", f"robots that leave {name}")
         (strips,) = made.static((*at, "paths"), "LineStrips3D:strips")

@@ -16,11 +16,10 @@ from mjfim.output.page import Page, as_sentence
 from mjfim.output.pages import page_of
 from mjfim.output.plots.pictures import pictures_of
 from mjfim.output.report import as_html, report_of
-from mjfim.records.campaign import CampaignStatus
+from mjfim.records.base import Level
 from mjfim.records.check import findings_of_check
 from mjfim.records.design import Status
-from mjfim.records.studies import DESIGN
-from mjfim.records.verdict import Level
+from mjfim.records.studies import DESIGN, CampaignStatus
 from tests.output.test_pages import ALONE, BROKEN, STOPPED, UNSTABLE, selection
 from tests.support import results
 from tests.support.pages import printed

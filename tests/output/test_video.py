@@ -22,7 +22,6 @@ from mjfim.experiment.system import System, simulate_system
 from mjfim.output.film import Film, film_of, film_of_motions, film_speed, positions_at
 from mjfim.output.page import DESIGNED, IDENTIFIED, INITIAL, MEASURED
 from mjfim.output.video import Video, render, report_video, require_format
-from mjfim.records.rehearsal import RobotMotions
 from mjfim.records.trajectory import Trajectory
 from tests.support import results
 from tests.support.cart_pendulum import cart_pendulum
@@ -96,7 +95,7 @@ class TestFilm:
         assert beside.caption == "The initial motion beside the designed motion, in real time."
 
         behind = identified(swing, four, higher)
-        assert [track.is_ghost for track in behind.views[0].tracks] == [False, True]
+        assert behind.views[0].named == {"identified": False, "measured": True}
         words = "The identified motion and the measured motion (transparent)"
         assert behind.caption.startswith(words)
 
@@ -112,8 +111,8 @@ class TestFilm:
         system = System.resolve(mjfim.Experiment.from_file(MODELS / "cart_pendulum.toml"))
         t = np.linspace(0.0, 4.0, 101)
         moves = np.multiply.outer([1.0, 1.2, 0.9, 1.1], np.sin(np.column_stack([t, 2.0 * t])))
-        motions = RobotMotions(robots=(3, 1, 2), t=t, qpos=moves[1:])
-        safe = results.rehearsal(motions=motions)
+        motions = dict(zip((3, 1, 2), moves[1:], strict=True))
+        safe = results.rehearsal(motion_times=t, motions=motions)
         margins = safe.margins.copy()
         margins[3] = -0.1
         designed = replace(results.evaluation(0.1, 50), trajectory=motion(t, moves[0]))
@@ -121,11 +120,10 @@ class TestFilm:
         left, right = film_of(
             system, replace(design, rehearsal=replace(safe, margins=margins))
         ).views
-        assert [track.term for track in left.tracks] == ["initial"]
-        assert [track.term for track in right.tracks] == ["designed", "unsafe", "rehearsed"]
-        assert [track.is_ghost for track in right.tracks] == [False, True, True]
-        for track, qpos in zip(right.tracks, moves[[0, 1, 3]], strict=True):
-            assert_allclose(track.qpos, qpos, atol=1e-12)
+        assert [term for term, _ in left.tracks] == ["initial"]
+        assert right.named == {"designed": False, "unsafe": True, "rehearsed": True}
+        for (_, drawn), qpos in zip(right.tracks, moves[[0, 1, 3]], strict=True):
+            assert_allclose(drawn, qpos, atol=1e-12)
 
         # Two safe robots are named once.
         film = film_of(system, design)

@@ -11,7 +11,7 @@ import pytest
 from mjfim.arrays import Array
 from mjfim.errors import RecordingError
 from mjfim.output.archive import write_table
-from mjfim.recordings.control_table import read_control
+from mjfim.recordings.delimited import read_control
 
 Read = Callable[..., Array]
 

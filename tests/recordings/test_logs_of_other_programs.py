@@ -30,8 +30,9 @@ from mjfim.model.coordinates import measurable_columns
 from mjfim.recordings.channels import Channels
 from mjfim.recordings.formats import read_columns
 from mjfim.recordings.proposal import proposed_recording
-from mjfim.recordings.read import Log, read_log
+from mjfim.recordings.read import LogSummary, read_log
 from mjfim.recordings.section import RecordingSpec
+from mjfim.records.trajectory import Recording
 
 Array = NDArray[np.float64]
 
@@ -56,7 +57,9 @@ PENDULUM = """
 </mujoco>
 """
 
-Read = Callable[..., Log]
+# A recording, and the summary of the log from which it was read.
+Logged = tuple[Recording, LogSummary]
+Read = Callable[..., Logged]
 
 
 def rows(*columns: Iterable[Any], head: str = "", between: str = ",", end: str = "\n") -> str:
@@ -165,7 +168,7 @@ TEXTS: dict[str, tuple[str, dict[str, Any]]] = {
 def read(tmp_path: Path) -> Read:
     """Read a file of the pendulum by a table [recording]."""
 
-    def run(name: str, content: bytes | None = None, **recording: Any) -> Log:
+    def run(name: str, content: bytes | None = None, **recording: Any) -> Logged:
         path = tmp_path / name
         if content is not None:
             path.write_bytes(content)
@@ -184,9 +187,9 @@ def read(tmp_path: Path) -> Read:
     return run
 
 
-def is_whole(log: Log, tolerance: float = 0.0) -> bool:
+def is_whole(log: Logged, tolerance: float = 0.0) -> bool:
     """Whether a log has the times, positions and controls of the pendulum."""
-    recording = log.recording
+    recording = log[0]
     return (
         recording.outputs == ("qpos:hinge",)
         and np.allclose(recording.t, T, rtol=0, atol=1e-9)
@@ -262,7 +265,7 @@ def test_messages_of_one_time_are_one_row(read: Read) -> None:
     text = sparse_rows((T, Q), (T, U))
     assert text.count("\n") == 2 * M + 1
     log = read("log.csv", text.encode(), **PLOTJUGGLER)
-    assert is_whole(log) and log.summary.dropped == 0
+    assert is_whole(log) and log[1].dropped == 0
 
 
 def test_a_topic_that_begins_later(read: Read) -> None:
@@ -272,8 +275,8 @@ def test_a_topic_that_begins_later(read: Read) -> None:
         RecordingWarning, match=r"rows left out: 2 before the first value of a control"
     ):
         log = read("log.csv", text.encode(), **PLOTJUGGLER)
-    recording = log.recording
-    assert (recording.ctrl[0, 0], log.summary.dropped) == (U[0], 2)
+    recording = log[0]
+    assert (recording.ctrl[0, 0], log[1].dropped) == (U[0], 2)
     assert np.array_equal(recording.y[np.isfinite(recording.y)], Q[2:])
     assert recording.t[np.isfinite(recording.y[:, 0])][0] == pytest.approx(0.02 - 0.013)
 
@@ -296,8 +299,8 @@ def test_a_few_stamps_out_of_order(changes: dict[int, float], read: Read) -> Non
     said = rf"log\.csv: rows left out: {len(left)} whose time"
     with pytest.warns(RecordingWarning, match=said):
         log = read("log.csv", text.encode(), columns=NAMED)
-    assert log.summary.dropped == len(left)
-    found = log.recording
+    assert log[1].dropped == len(left)
+    found = log[0]
     assert np.array_equal([found.t, found.y[:, 0]], np.delete([T, Q], left, axis=1))
     assert np.array_equal(found.ctrl[:, 0], np.delete(U[:-1], left))
 
@@ -320,7 +323,7 @@ WORDS = ("NaN", ".nan", "", "None", "-nan(ind)", "--", " NaN", "  ", "NaN ")
 @pytest.mark.parametrize("word", WORDS)
 def test_missing_numbers(word: str, read: Read) -> None:
     text = rows(T, [word if i == 50 else q for i, q in enumerate(Q)], U, head="t,q,u")
-    recording = read("log.csv", text.encode(), columns=NAMED).recording
+    recording = read("log.csv", text.encode(), columns=NAMED)[0]
     assert np.flatnonzero(np.isnan(recording.y[:, 0])).tolist() == [50]
 
 

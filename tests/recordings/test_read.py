@@ -19,11 +19,14 @@ from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
 from mjfim.output.archive import write_table
-from mjfim.recordings.read import Log, RowReader, read_log, read_recording
+from mjfim.recordings.read import LogSummary, RowReader, read_log, read_recording
+from mjfim.records.trajectory import Recording
 from tests.support.closed_loop import arm_experiment
 
 Array = NDArray[np.float64]
-Read = Callable[..., Log]
+# A recording, and the summary of the log from which it was read.
+Logged = tuple[Recording, LogSummary]
+Read = Callable[..., Logged]
 
 ARM = """
 <mujoco>
@@ -85,7 +88,7 @@ def read(tmp_path: Path) -> Read:
     added unless `bare`.
     """
 
-    def run(columns: Mapping[str, Any], /, bare: bool = False, **recording: Any) -> Log:
+    def run(columns: Mapping[str, Any], /, bare: bool = False, **recording: Any) -> Logged:
         path = tmp_path / "lab.csv"
         write_table(path, dict(columns) if bare else {"t": T, **CTRL, **columns})
         return read_log(path, task_of(tmp_path, recording).system.channels)
@@ -93,11 +96,11 @@ def read(tmp_path: Path) -> Read:
     return run
 
 
-def column(logged: Log, name: str) -> Array:
+def column(logged: Logged, name: str) -> Array:
     """Values of a measured column or of a control, by its name."""
     if name in CTRL:
-        return logged.recording.ctrl[:, [*CTRL].index(name)]
-    return logged.recording.y[:, logged.recording.outputs.index(name)]
+        return logged[0].ctrl[:, [*CTRL].index(name)]
+    return logged[0].y[:, logged[0].outputs.index(name)]
 
 
 def wave(amplitude: float = 1.0, frequency: float = 2.0) -> Array:
@@ -181,8 +184,8 @@ def test_time_units(unit: str, factor: float, read: Read) -> None:
     logged = read(
         {"stamp": (t + 1000.0) * factor, "qpos:pin": wave()}, time="stamp", time_unit=unit
     )
-    assert np.allclose(logged.recording.t, t - t[0], rtol=0, atol=1e-9)
-    assert logged.recording.t[0] == 0.0
+    assert np.allclose(logged[0].t, t - t[0], rtol=0, atol=1e-9)
+    assert logged[0].t[0] == 0.0
 
 
 def test_window(read: Read) -> None:
@@ -192,8 +195,8 @@ def test_window(read: Read) -> None:
     ctrl = np.where(np.arange(M) % 3 == 0, np.arange(M, dtype=float), np.nan)
     columns = {"qpos:pin": wave(), "ctrl:push": ctrl}
     logged = read({**columns, "t": T + 5.0}, window=(0.52, 1.0))
-    r = logged.recording
-    assert (len(r.t), r.t[0], logged.summary.dropped) == (97, 0.0, M - 97)
+    r = logged[0]
+    assert (len(r.t), r.t[0], logged[1].dropped) == (97, 0.0, M - 97)
     assert np.allclose(r.t, T[:97], rtol=0, atol=1e-12)
     assert np.array_equal(column(logged, "qpos:pin"), wave()[104:201])
     assert r.ctrl[:4, 0].tolist() == [102.0, 105.0, 105.0, 105.0]
@@ -367,8 +370,8 @@ REFUSED: list[tuple[dict[str, Array], dict[str, Any], str]] = [
 def test_sound_logs(columns: dict[str, Array], recording: dict[str, Any], read: Read) -> None:
     """Every row is read, and what is empty stays empty."""
     logged = read({"qpos:pin": wave(), **columns}, **recording)
-    assert len(logged.recording.t) == M
-    for name in {*columns} & {*logged.recording.outputs}:
+    assert len(logged[0].t) == M
+    for name in {*columns} & {*logged[0].outputs}:
         assert_array_equal(column(logged, name), columns[name])
 
 
@@ -387,8 +390,8 @@ def test_a_control_may_be_a_constant_that_no_column_holds(read: Read) -> None:
     alone = read({"t": T, "qpos:pin": wave()}, bare=True, columns=off)
     beside = read({"qpos:pin": wave()}, columns=off)
     for logged in (alone, beside):
-        assert np.array_equal(logged.recording.ctrl, np.tile([0.0, 0.25], (M - 1, 1)))
-        assert [each.name for each in logged.summary.columns] == ["qpos:pin"]
+        assert np.array_equal(logged[0].ctrl, np.tile([0.0, 0.25], (M - 1, 1)))
+        assert [each.name for each in logged[1].columns] == ["qpos:pin"]
     said = r"column 'ctrl:push' is missing.*constant, state the value: \"ctrl:push\" = 0\.0\. "
     with pytest.raises(RecordingError, match=said):
         read({"t": T, "qpos:pin": wave(), "ctrl:turn": T}, bare=True)
@@ -401,7 +404,7 @@ def test_summary(read: Read) -> None:
     t = T + 0.02 * (COUNT > 99)
     q = np.round(wave(1.0, 3.0) / 0.01) * 0.01
     q[:40:4] = np.nan
-    summary = read({"t": t, "q": q}, columns={"qpos:pin": "q"}, window=(0.0, 1.5)).summary
+    summary = read({"t": t, "q": q}, columns={"qpos:pin": "q"}, window=(0.0, 1.5))[1]
     assert (summary.rows, summary.dropped) == (297, M - 297)
     found = (summary.rate, summary.duration, summary.longest_step, summary.jitter_std)
     assert found == pytest.approx((200.0, 1.5, 0.025, 0.02 * np.sqrt(1 / 296 - 1 / 296**2)))
@@ -422,7 +425,7 @@ def test_design_archives_are_recordings(tmp_path: Path) -> None:
     path = tmp_path / "d.npz"
     qpos, ctrl = np.split(np.random.default_rng(0).standard_normal((M, 5)), [3], axis=1)
     np.savez(path, t=T, qpos=qpos, ctrl=ctrl[1:], gain=np.zeros((M - 1, 2, 6)))
-    recording = read_log(path, task_of(tmp_path, {}).system.channels).recording
+    recording = read_log(path, task_of(tmp_path, {}).system.channels)[0]
     assert_array_equal(recording.ctrl, ctrl[1:])
     assert recording.outputs == ("qpos:rail", "qpos:pin", "qpos:stop")
     assert_array_equal(recording.y, qpos)
@@ -504,7 +507,7 @@ def test_rows_are_read_as_files_are(read: Read, tmp_path: Path) -> None:
     reader = RowReader(header, channels, "stdin")
     rows = [row for row in map(reader.row, lines) if row is not None]
     t, ctrl, y = map(np.array, zip(*rows, strict=True))
-    whole, count = logged.recording, len(t)
+    whole, count = logged[0], len(t)
     assert len(whole.t) == count == 301
     held = np.column_stack([COUNT - COUNT % 3, np.full(M, 0.5)])
     for times, controls in ((whole.t, whole.ctrl), (t - t[0], ctrl[:-1])):

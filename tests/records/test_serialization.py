@@ -99,7 +99,8 @@ def awkward(kind: type[SavedRecord], count: int, is_optional_given: bool) -> Sav
         if origin is tuple:
             return tuple(map(build, entries[:1] * count if entries[-1] is Ellipsis else entries))
         if origin is dict:
-            return {f"{text}{i}": build(entries[1]) for i, text in enumerate(TEXTS[:count])}
+            names = [f"{text}{i}" if entries[0] is str else i for i, text in enumerate(TEXTS)]
+            return {name: build(entries[1]) for name in names[:count]}
         if dataclasses.is_dataclass(hint):
             hints = get_type_hints(hint)
             return hint(**{name: build(hints[name]) for name in saved_fields(hint)})
@@ -205,7 +206,7 @@ FAULTS = [
         rf"'initial\.trajectory\.qpos': .*the array 'initial_qpos' is missing; {AGAIN}",
     ),
     ("theta", np.array(["a"]), r"the array 'theta' does not hold numbers"),
-    ("version", 99, rf"design\.npz: has version 99, not 3; {AGAIN}"),
+    ("version", 99, rf"design\.npz: has version 99, not 4; {AGAIN}"),
     ("type", "Check", r"design\.npz: holds a record of type Check, not Design"),
     ("colour", "red", r"the field 'colour': Unexpected keyword"),
     ("status", "BORED", r"the field 'status': Input should be .*converged"),

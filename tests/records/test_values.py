@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from mjfim.errors import MjfimError
-from mjfim.records.values import ParameterValue
+from mjfim.records.base import ParameterValue
 from tests.support import results
 
 TARGETS = (("body/bob:mass",), ("body/bob:pos[2]", "geom/rod:size[1]"), ())

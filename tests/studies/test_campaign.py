@@ -31,8 +31,8 @@ from mjfim.output.campaign_folder import (
 )
 from mjfim.output.manifest import MANIFEST
 from mjfim.parallel.budget import StopToken
-from mjfim.records.campaign import Campaign, CampaignStatus, EarlierRound
 from mjfim.records.design import Design, Status
+from mjfim.records.studies import Campaign, CampaignStatus, EarlierRound
 from mjfim.records.trajectory import Recording
 from mjfim.studies import campaign as campaign_module
 from mjfim.studies.campaign import restate_experiment

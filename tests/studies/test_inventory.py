@@ -60,7 +60,7 @@ def test_outputs_actuators_keyframes_and_limits_are_listed() -> None:
     inventory = list_model(MODELS / "quadrotor.xml")
     assert {each.name for each in inventory.actuators} == {"fl", "fr", "rl", "rr"}
     assert [each.name for each in inventory.keyframes] == ["hover"]
-    assert {(each.quantity, each.lower, each.upper) for each in inventory.limits} == {
+    assert {(each.kind, each.lower, each.upper) for each in inventory.limits} == {
         ("control", 0.0, 1.0)
     }
     gyro = next(each for each in inventory.outputs if each.name == "imu_gyro[0]")
@@ -77,7 +77,7 @@ def test_elements_without_a_name_and_ranges_that_are_not_kept_are_said(tmp_path:
 
     # The range of a ball joint is its largest angle.
     turned = next(limit for limit in inventory.limits if limit.name == "ball")
-    assert (turned.quantity, turned.lower, turned.unit) == ("position", 0.0, "rad")
+    assert (turned.kind, turned.lower, turned.unit) == ("position", 0.0, "rad")
     assert turned.upper == pytest.approx(np.deg2rad(1.0))
 
 

@@ -21,10 +21,10 @@ from mjfim.identification.assessment.robust_covariance import (
     robust_uncertainty,
 )
 from mjfim.output.pages import page_of
+from mjfim.records.base import Level
 from mjfim.records.estimate import PriorDirections
 from mjfim.records.robots import RobotComparison
 from mjfim.records.trajectory import Recording
-from mjfim.records.verdict import Level
 from mjfim.studies.robot_comparison import compare_estimates, holm, honest_std
 from tests.identification.test_robust_covariance import FINE, Linear, noise, waves
 from tests.support.made_records import bare_estimate

@@ -5,15 +5,15 @@ from __future__ import annotations
 from rich.console import Console
 
 from mjfim.output.page import Page, Part, Text
-from mjfim.output.terminal import TerminalPage
-from mjfim.records.verdict import Level, Verdict
+from mjfim.output.terminal import laid_out
+from mjfim.records.base import Level, Verdict
 
 
 def printed(page: Page, width: int = 200, *, verbose: bool = False) -> str:
     """The text in a terminal without colours."""
     console = Console(width=width, no_color=True)
     with console.capture() as capture:
-        console.print(TerminalPage(page, verbose))
+        console.print(laid_out(page, console, verbose=verbose))
     return "\n".join(line.rstrip() for line in capture.get().splitlines())
 
 

@@ -7,8 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from mjfim.arrays import Array
-from mjfim.records.campaign import Campaign, CampaignStatus, Round
-from mjfim.records.check import Check, ConfoundedPair, ParameterCheck, SelfTest
+from mjfim.records.check import Check, ParameterCheck, SelfTest
 from mjfim.records.design import (
     Design,
     Evaluation,
@@ -27,16 +26,18 @@ from mjfim.records.estimate_parts import InformationInTime, ResidualForce
 from mjfim.records.rehearsal import (
     Fan,
     FiniteSteps,
+    LimitRange,
     Rehearsal,
-    RehearsedLimit,
-    RobotMotions,
 )
 from mjfim.records.robots import RobotComparison
 from mjfim.records.studies import (
     DESIGN,
+    Campaign,
+    CampaignStatus,
     Comparison,
     MethodOutcome,
     MonteCarloStudy,
+    Round,
     TrialStatistics,
 )
 from mjfim.records.terms import Term, TermNumber
@@ -302,7 +303,6 @@ def check(parameters: tuple[str, ...] = PARAMETERS, **changes: object) -> Check:
         information=np.linalg.inv(covariance(std)),
         eigenvalues=np.array([1.0, 2.0, 30.0]),
         correlation=covariance(np.ones(3)),
-        confounded=(ConfoundedPair(first=parameters[0], second=parameters[1], correlation=0.8),),
         not_separable=(),
         not_excited=(),
         self_test=SelfTest(recursion=1e-8, slope=1e-6),
@@ -384,7 +384,7 @@ def finite_steps(
     )
 
 
-def fan(limit: RehearsedLimit) -> Fan:
+def fan(limit: LimitRange) -> Fan:
     """A sine on robots that are up to 20 % off, and 2 % after the experiment."""
     t = np.linspace(0.0, 2.0, 50)
     model = 0.6 * np.sin(6.0 * t)
@@ -399,7 +399,7 @@ def rehearsal(
     random = np.random.default_rng(0)
     rows = np.ones((21, 1))
     limits = tuple(
-        RehearsedLimit(kind=kind, name=name, lower=-1.0, upper=1.0, scale=1.0, unit=unit)
+        LimitRange(kind=kind, name=name, lower=-1.0, upper=1.0, scale=1.0, unit=unit)
         for kind, unit in (("position", "rad"), ("velocity", "rad/s"))
     )
     made = Rehearsal(
@@ -429,9 +429,8 @@ def rehearsal(
         unbraked={},
         steps=finite_steps(parameters),
         fans=tuple(map(fan, limits)),
-        motions=RobotMotions(
-            robots=(1, 2), t=np.array([0.0, 2.0]), qpos=np.array([[[0.1]], [[0.2]]]) * rows[:2]
-        ),
+        motion_times=np.array([0.0, 2.0]),
+        motions={1: 0.1 * rows[:2], 2: 0.2 * rows[:2]},
     )
     return replace(made, **changes)
 

@@ -45,7 +45,7 @@ def write_player(path: Path, plan: RobotPlan) -> None:
     system, space, drives = plan.system, plan.system.space, plan.drives
     names = list(state_names(system.model))
     sigma = dict(zip(system.outputs.names, np.sqrt(np.diag(system.noise.covariance)), strict=True))
-    rows = np.column_stack([*design_columns(plan.playback, system).values()])
+    rows = np.column_stack([*design_columns(plan.playback, plan.gain, system).values()])
     design = {
         "name": plan.name,
         "gains": GAIN_NOTE,

@@ -43,7 +43,7 @@ from mjfim.model.units import AFFINE, AT_JOINT, actuator_gear, is_integrated, se
 from mjfim.output.archive import reference_columns, simulate_playback
 from mjfim.recordings.formats import CONTROL_TOPIC, JOINT_STATE, module_of_extra
 from mjfim.records.design import Design
-from mjfim.records.trajectory import Playback
+from mjfim.records.trajectory import Trajectory
 
 # What a control means; that of a servo is a position or a velocity.
 Meaning = Literal["force", "position", "velocity", "other"]
@@ -81,13 +81,15 @@ class RobotPlan:
         name: Name of the experiment.
         system: The experiment.
         playback: The M rows of control and the final state, as in design.csv.
+        gain: (M, nu, nx) their feedback gains [control unit / state unit].
         reference: (M+1,) columns of reference.csv by name.
         drives: The nu controls, in the order of the model.
     """
 
     name: str
     system: System
-    playback: Playback
+    playback: Trajectory
+    gain: Array
     reference: dict[str, Array]
     drives: tuple[Drive, ...]
 
@@ -105,11 +107,12 @@ class RobotPlan:
             SimulationDivergedError: The simulation diverges.
         """
         check_fits(file or "the design", design.trajectory, system)
-        playback = simulate_playback(system, design.trajectory, design.final.gain)
+        playback, gain = simulate_playback(system, design.trajectory, design.final.gain)
         return cls(
             name=Path(system.experiment.source).stem,
             system=system,
             playback=playback,
+            gain=gain,
             reference=reference_columns(playback, system),
             drives=_drives(system),
         )
@@ -225,7 +228,7 @@ def write_lerobot_dataset(folder: Path, plan: RobotPlan, unit: str = "rad") -> N
     Raises:
         ExperimentError: The rate of the rows is not a whole number of frames per second.
     """
-    rate = 1.0 / plan.playback.period
+    rate = 1.0 / plan.playback.dt
     fps, rows = round(rate), len(plan.playback.t)
     if fps < 1 or abs(rate - fps) > RATE_TOLERANCE * rate:
         raise ExperimentError(

@@ -36,7 +36,14 @@ from mjfim.output.words import (
     sigma_remark,
     when_learnt,
 )
-from mjfim.records.check import Check, ParameterCheck, ParameterGroup, unknown_groups
+from mjfim.records.base import Level, Verdict
+from mjfim.records.check import (
+    Check,
+    ParameterCheck,
+    ParameterGroup,
+    combination_terms,
+    unknown_groups,
+)
 from mjfim.records.design import (
     TIE_TOLERANCE,
     Design,
@@ -45,8 +52,7 @@ from mjfim.records.design import (
     is_playable,
     keeps_limits,
 )
-from mjfim.records.rehearsal import REST_SHARE, Rehearsal, RehearsedLimit, Valley
-from mjfim.records.verdict import Level, Verdict
+from mjfim.records.rehearsal import REST_SHARE, LimitRange, Rehearsal, Valley
 
 # Ratio of two standard deviations above which one of them counts as smaller.
 RELEVANT_RATIO = 1.05
@@ -208,7 +214,7 @@ def _floor(rehearsal: Rehearsal) -> str:
     return "the floor" if rehearsal.has_floor else f"the floor that is assumed at {height}"
 
 
-def _kind(limit: RehearsedLimit) -> str:
+def _kind(limit: LimitRange) -> str:
     return limit.kind.replace("_", " ")
 
 
@@ -810,7 +816,8 @@ def _groups(title: str, groups: tuple[ParameterGroup, ...], check: Check) -> Ite
     }
     items = []
     for group in groups:
-        lines = [f"  {each}{accuracy.get(str(each), '')}" for each in group.combinations]
+        combinations = [" ".join(combination_terms(each)) for each in group.combinations]
+        lines = [f"  {each}{accuracy.get(each, '')}" for each in combinations]
         members = f"{', '.join(group.members)} only as"
         items.append("\n".join([members, *lines]) if lines else str(group))
     if items:

@@ -32,11 +32,11 @@ from mjfim.output.page import (
 )
 from mjfim.output.pages.studies import residual_parts
 from mjfim.output.words import NOT_ALONE, predicted_data, relative, share_note
+from mjfim.records.base import Level, Verdict
 from mjfim.records.estimate import Estimate, HorizonStudy, ParameterDraws, Prediction
 from mjfim.records.estimate_parts import MOST, InformationInTime
 from mjfim.records.robots import RecordingComparison, p_text
 from mjfim.records.terms import Decision, Selection, SelectionStep, as_toml
-from mjfim.records.verdict import Level, Verdict
 
 # Largest number of digits of an estimate.
 MAX_DIGITS = 9

@@ -18,8 +18,8 @@ from mjfim.output.page import (
     number,
 )
 from mjfim.recordings.read import ColumnSummary, LogSummary
+from mjfim.records.base import Level, Verdict
 from mjfim.records.inventory import Inventory, StatedExperiment
-from mjfim.records.verdict import Level, Verdict
 
 # Jitter of a log below this fraction of the sample period is round-off of the time stamps.
 JITTER_ROUND_OFF = 1e-6
@@ -76,7 +76,7 @@ def inventory_page(inventory: Inventory) -> Page:
             "Limits: ranges of the MJCF, which a design keeps",
             "quantity, name, lower, upper, unit",
             [
-                (each.quantity, each.name, _known(each.lower), _known(each.upper), each.unit)
+                (each.kind, each.name, _known(each.lower), _known(each.upper), each.unit)
                 for each in inventory.limits
             ],
         ),
@@ -106,19 +106,27 @@ def experiment_page(stated: StatedExperiment) -> Page:
             f"parameter, {NOMINAL}, lower bound, upper bound, nuisance",
             [
                 (
-                    named(each.name, each.unit),
-                    number(each.guess, 5),
-                    number(each.lower),
-                    number(each.upper),
-                    "yes" if each.nuisance else "",
+                    named(name, unit),
+                    number(guess, 5),
+                    *map(number, bounds),
+                    "yes" if name in stated.nuisance else "",
                 )
-                for each in stated.parameters
+                for name, unit, guess, bounds in zip(
+                    stated.parameters,
+                    stated.units,
+                    stated.guess.tolist(),
+                    stated.bounds.tolist(),
+                    strict=True,
+                )
             ],
         ),
         _table(
             "Measured outputs",
             "output, σ of the noise",
-            [(named(each.name, each.unit), number(each.sigma)) for each in stated.outputs],
+            [
+                (named(name, stated.output_units[name]), number(sigma))
+                for name, sigma in stated.sigma.items()
+            ],
         ),
         _table(
             "Control laws in the loop",
@@ -132,7 +140,7 @@ def experiment_page(stated: StatedExperiment) -> Page:
             "Limits of a design, with the ranges of the MJCF",
             "quantity, name, lower, upper, unit",
             [
-                (each.quantity, each.name, number(each.lower, 5), number(each.upper, 5), each.unit)
+                (each.kind, each.name, number(each.lower, 5), number(each.upper, 5), each.unit)
                 for each in stated.limits
             ],
         ),

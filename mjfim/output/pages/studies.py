@@ -31,17 +31,18 @@ from mjfim.output.page import (
     warned,
 )
 from mjfim.output.words import BEST_CASE, NOT_ALONE, relative
-from mjfim.records.campaign import Campaign, CampaignStatus
+from mjfim.records.base import Level, Verdict
 from mjfim.records.estimate_parts import InverseDynamicsFit, ResidualForce
 from mjfim.records.robots import RobotComparison, p_text
 from mjfim.records.studies import (
     DESIGN,
+    Campaign,
+    CampaignStatus,
     Comparison,
     MethodResult,
     MonteCarloStudy,
     TrialStatistics,
 )
-from mjfim.records.verdict import Level, Verdict
 from mjfim.records.worth import Watch
 
 # What to do after a campaign, by how it ended.

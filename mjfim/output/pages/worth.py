@@ -21,7 +21,7 @@ from mjfim.output.page import (
     warned,
 )
 from mjfim.output.words import NOT_ALONE, improvement
-from mjfim.records.verdict import Level, Verdict
+from mjfim.records.base import Level, Verdict
 from mjfim.records.worth import Price, Worth
 
 # Increase of σ up to which a sensor is hardly needed, and from which its row is marked (factors).

@@ -24,14 +24,13 @@ from mjfim.output.plots import design as of_design
 from mjfim.output.plots import estimate as of_estimate
 from mjfim.output.plots import estimate_studies, studies
 from mjfim.records.base import ShownRecord
-from mjfim.records.campaign import Campaign
 from mjfim.records.check import Check
 from mjfim.records.design import Design
 from mjfim.records.estimate import Estimate
 from mjfim.records.estimate_parts import InverseDynamicsFit
 from mjfim.records.rehearsal import Rehearsal
 from mjfim.records.robots import RobotComparison
-from mjfim.records.studies import Comparison, MonteCarloStudy
+from mjfim.records.studies import Campaign, Comparison, MonteCarloStudy
 from mjfim.records.worth import Watch, Worth
 
 if TYPE_CHECKING:

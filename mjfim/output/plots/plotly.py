@@ -6,14 +6,13 @@ A page holds all its pictures in one file. Curves are therefore thinned, and num
 from __future__ import annotations
 
 import base64
-from collections.abc import Sequence
 from dataclasses import replace
 from html import escape
 from typing import Any
 
 import numpy as np
 
-from mjfim.arrays import Array, record
+from mjfim.arrays import Array
 from mjfim.output.panels import Axis, Cells, Mark, Panel, Picture
 from mjfim.output.words import shorten
 
@@ -39,16 +38,6 @@ SYMBOLS = {
     ">": "triangle-right",
 }
 
-# Shapes of marks in the legend; others are lines.
-SHAPES = {
-    "dots": "dot",
-    "bars": "bar",
-    "columns": "bar",
-    "area": "band",
-    "vspan": "band",
-    "hspan": "band",
-}
-
 # CSS pixels of a point, of an inch, and of the lowest plot.
 PIXELS, INCH, LEAST_HEIGHT = 1.3, 100, 170
 
@@ -59,43 +48,20 @@ LETTER, NAME_WIDTH = 6.5, 26
 SHORT_LOG_AXIS = 2.5
 
 
-@record
-class Key:
-    """An entry of the legend: its name, role and shape."""
-
-    name: str
-    role: str
-    shape: str
+# A panel of a page, whether it takes the whole width, and its data.
+Plot = tuple[Panel, bool, Plotly]
 
 
-@record
-class Plot:
-    """One plot: its words and its size, and the data that the script of the page reads."""
-
-    title: str
-    remark: str
-    height: int
-    is_wide: bool
-    data: Plotly
-
-
-@record
-class Group:
-    """Plots of one picture, under one legend."""
-
-    title: str
-    plots: Sequence[Plot]
-    keys: Sequence[Key]
-    note: str
-    columns: int
-
-
-def group_of(picture: Picture, limit: int) -> Group:
+def plots_of(picture: Picture, limit: int) -> list[Plot]:
     """Turn a picture into plots.
 
     Args:
         picture: The picture.
         limit: Largest number of points of a curve.
+
+    Returns:
+        Of each panel: the panel, whether it takes the whole width, and what the script of the page
+        reads.
     """
     # Only the lowest panel of a column names the axis that all panels of the column share. A panel
     # below all columns has an axis of its own.
@@ -104,34 +70,19 @@ def group_of(picture: Picture, limit: int) -> Group:
         for panel in picture.panels
         if panel.x.label and (len(picture.widths) == 1 or not panel.is_wide)
     }
-    keys = [
-        Key(name=mark.label, role=mark.role, shape=SHAPES.get(mark.kind, "line"))
-        for mark in picture.legend()
-    ]
-    columns = len(picture.widths)
     plots = []
     for panel in picture.panels:
         label = panel.x.label or shared.get(panel.place[1], "")
-        height = max(int(INCH * picture.heights[panel.place[0]]), LEAST_HEIGHT)
-        linked = "" if panel.x.names is not None or panel.cells else f"{picture.title} {label}"
-        plots.append(
-            Plot(
-                title=panel.title or panel.y.label,
-                remark=panel.remark,
-                height=height,
-                is_wide=panel.is_wide or columns == 1,
-                data={
-                    "traces": [trace for mark in panel.marks for trace in _traces(mark, limit)]
-                    + ([] if panel.cells is None else [_heatmap(panel.cells)]),
-                    "layout": _layout(panel, label),
-                    "height": height,
-                    "linked": linked,
-                },
-            )
-        )
-    return Group(
-        title=picture.title, plots=plots, keys=keys, note=picture.note, columns=min(columns, 3)
-    )
+        is_linked = panel.x.names is None and not panel.cells
+        data = {
+            "traces": [trace for mark in panel.marks for trace in _traces(mark, limit)]
+            + ([] if panel.cells is None else [_heatmap(panel.cells)]),
+            "layout": _layout(panel, label),
+            "height": max(int(INCH * picture.heights[panel.place[0]]), LEAST_HEIGHT),
+            "linked": f"{picture.title} {label}" if is_linked else "",
+        }
+        plots.append((panel, panel.is_wide or len(picture.widths) == 1, data))
+    return plots
 
 
 # ---- marks

@@ -68,12 +68,12 @@ from mjfim.output.words import (
     squared_unit,
     without_zeros,
 )
-from mjfim.records.campaign import Campaign
 from mjfim.records.check import CONFOUNDED_CORRELATION, Check
 from mjfim.records.rehearsal import MAX_PATHS, Rehearsal, Separation, Valley
 from mjfim.records.robots import RobotComparison
 from mjfim.records.studies import (
     DESIGN,
+    Campaign,
     Comparison,
     MethodResult,
     MonteCarloStudy,

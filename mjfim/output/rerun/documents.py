@@ -53,7 +53,6 @@ from mjfim.output.rerun.plots import (
     grid_tabs,
     log_series,
     planes_of,
-    rgb,
     series_tabs,
     with_curves,
 )
@@ -61,7 +60,6 @@ from mjfim.output.rerun.scene import (
     PATH_THICKNESS,
     BodyPoses,
     EntityParts,
-    RobotStyle,
     body_parts,
     body_poses,
     drawn_shapes,
@@ -72,6 +70,7 @@ from mjfim.output.rerun.scene import (
     log_pose,
     log_robot,
     pale_shapes,
+    rgb,
     time_column,
 )
 from mjfim.records.design import Design
@@ -152,10 +151,9 @@ def log_design(
         _log_robots(rec, model, poses, {}, [INITIAL])
         for name, pair in zip(poses, beside[0], strict=False):
             for k, (each, role) in enumerate(zip(pair, ROBOT_ROLES, strict=True), start=1):
-                style = RobotStyle(accent=rgb(role), outline=True)
                 ghost = body_poses(model, each.t, each.qpos)
                 root = ("robots", name, f"robot {k}")
-                log_robot(rec, model, root, ghost, style, is_ghost=True)
+                log_robot(rec, model, root, ghost, role, is_ghost=True)
         _log_iterates(rec, model, design, iterates)
         if design.rehearsal is not None:
             _log_rehearsed(rec, model, design.rehearsal, poses[DESIGNED])
@@ -262,11 +260,6 @@ def _poses_of(model: mujoco.MjModel, motions: Mapping[str, Trajectory]) -> dict[
     return {name: body_poses(model, each.t, each.qpos) for name, each in motions.items()}
 
 
-def style_of(role: str) -> RobotStyle:
-    """Return the style of the robot of a role; a measured one is an outline."""
-    return RobotStyle(accent=rgb(role), outline=role == MEASURED)
-
-
 def _thinned(trajectory: Trajectory) -> Trajectory:
     """Return at most `MAX_SAMPLES` evenly spread samples of a trajectory."""
     rows = evenly_spread_indices(len(trajectory.t), MAX_SAMPLES)
@@ -313,13 +306,13 @@ def _log_iterates(
         plane.log(rec)
         still = plane.curve(*start, INITIAL, 0.6)
         rec.log(entity_path((*plane.parts, "initial")), still, static=True, strict=True)
-    root, style = ("robots", DESIGNED), style_of(DESIGNED)
+    root = ("robots", DESIGNED)
     middle = design.initial.trajectory.qpos[len(design.initial.trajectory.t) // 2]
     still_poses = body_poses(model, np.zeros(1), middle[None])
     designed = body_poses(model, design.trajectory.t, design.trajectory.qpos)
     end = end_point(model, designed)
     rec.set_time("sim_time", duration=0.0)
-    log_end_path(rec, root, designed, end, style)
+    log_end_path(rec, root, designed, end, DESIGNED)
     rec.reset_time()
     motions = design.motions
     if motions is None:
@@ -330,7 +323,7 @@ def _log_iterates(
         poses = body_poses(model, motions.t[i], qpos)
         log_pose(rec, model, root, poses, len(qpos) // 2)
         log_pose(rec, model, ("robots", INITIAL), still_poses, 0)
-        log_end_path(rec, root, poses, end, style)
+        log_end_path(rec, root, poses, end, DESIGNED)
         for plane, _, curves in plots:
             curve = plane.curve(*curves[i], DESIGNED)
             rec.log(entity_path((*plane.parts, "iterate")), curve, strict=True)
@@ -341,11 +334,11 @@ def _log_rehearsed(
     rec: rr.RecordingStream, model: mujoco.MjModel, rehearsal: Rehearsal, designed: BodyPoses
 ) -> None:
     """Log the paths of the ends of robots that play the design, and the ends as moving points."""
-    motions, end = rehearsal.motions, end_point(model, designed)
-    if motions is None or end is None:
+    t, motions, end = rehearsal.motion_times, rehearsal.motions, end_point(model, designed)
+    if end is None:
         return
-    paths = [body_poses(model, motions.t, qpos).world_paths(*end)[:, 0] for qpos in motions.qpos]
-    unsafe = rehearsal.unsafe[list(motions.robots)]
+    paths = [body_poses(model, t, qpos).world_paths(*end)[:, 0] for qpos in motions.values()]
+    unsafe = rehearsal.unsafe[list(motions)]
     for name, colour, chosen in (
         ("robots that leave no limit", rgb(MEASURED), ~unsafe),
         ("robots that leave a limit", rgb(NOMINAL), unsafe),
@@ -360,8 +353,8 @@ def _log_rehearsed(
         look = rr.Points3D.from_fields(colors=[colour], radii=rr.Radius.ui_points(3.0))
         rec.log(entity_path((*parts, "ends")), look, static=True, strict=True)
         ends = rr.Points3D.columns(positions=np.stack(found, axis=1).reshape(-1, 3))
-        rows = ends.partition([len(found)] * len(motions.t))
-        rec.send_columns(entity_path((*parts, "ends")), [time_column(motions.t)], rows, strict=True)
+        rows = ends.partition([len(found)] * len(t))
+        rec.send_columns(entity_path((*parts, "ends")), [time_column(t)], rows, strict=True)
 
 
 # ---- layout
@@ -449,7 +442,7 @@ def robot_views(
         if camera.followed is not None:
             # A camera can follow a shape, but no body, whose entity has no shape of its own.
             parts = body_parts(model, followed or root, camera.followed)
-            shapes = drawn_shapes(model, camera.followed, RobotStyle(accent=(0, 0, 0)))
+            shapes = drawn_shapes(model, camera.followed, DESIGNED)
             tracked = entity_path((*parts, *(shape.name for shape in islice(shapes, 1))))
         view = rrb.Spatial3DView(
             origin=entity_path(root),
@@ -487,8 +480,7 @@ def _robots(
     still = place_camera(model, motions, views=1, aspect=aspect, follow=False)
     pale: dict[str, rrb.Visualizer] = {}
     for name in names[:-1]:
-        style = style_of((roles or {}).get(name, name))
-        pale |= pale_shapes(model, ("robots", name), style)
+        pale |= pale_shapes(model, ("robots", name), (roles or {}).get(name, name))
     overlay = robot_views(model, still, {"overlay": ("robots",)}, overrides=pale)[0]
     return rrb.Tabs(separate, overlay, active_tab=0)
 
@@ -502,10 +494,10 @@ def _log_robots(
 ) -> None:
     """Log robots by their names, some of them with the path of the end."""
     for name, each in poses.items():
-        root, style = ("robots", name), style_of(roles.get(name, name))
-        log_robot(rec, model, root, each, style)
+        root, role = ("robots", name), roles.get(name, name)
+        log_robot(rec, model, root, each, role)
         if name in with_path:
-            log_end_path(rec, root, each, end_point(model, each), style, static=True)
+            log_end_path(rec, root, each, end_point(model, each), role, static=True)
 
 
 # ---- the viewer

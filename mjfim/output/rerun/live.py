@@ -27,9 +27,8 @@ from mjfim.output.rerun.documents import (
     LEFT_TO_RIGHT,
     blueprint_of,
     robot_views,
-    style_of,
 )
-from mjfim.output.rerun.plots import Plane, grid_tabs, rgb
+from mjfim.output.rerun.plots import Plane, grid_tabs
 from mjfim.output.rerun.scene import (
     BodyPoses,
     body_poses,
@@ -38,6 +37,7 @@ from mjfim.output.rerun.scene import (
     log_end_path,
     log_pose,
     log_robot,
+    rgb,
 )
 from mjfim.records.design import HistoryRow
 from mjfim.records.events import Callback, DesignEvent, Event, FitEvent, StudyEvent
@@ -54,8 +54,7 @@ FLUSH_SECONDS = 3.0
 # of the robot.
 TIMELINE, STREAM_TIMELINE, ROBOT = "event", "time", ("robot",)
 
-# Style of the robot, and roles of curves that share a plot.
-STYLE = style_of(DESIGNED)
+# Roles of curves that share a plot.
 ROLES_IN_TURN = (DESIGNED, INITIAL, MEASURED, NOMINAL, IDENTIFIED, OTHER)
 
 # Name, colour and width of the curves of other starts than the one of the best iterate.
@@ -208,7 +207,7 @@ class LiveShow:
         place = [known for beside, known in self._curves if beside == plot].index(name)
         colour, shown, width = rgb(ROLES_IN_TURN[place % len(ROLES_IN_TURN)]), name, BEST_WIDTH
         if plot in PLOTS_BY_START:
-            colour = STYLE.accent
+            colour = rgb(DESIGNED)
             if self._best is not None and self._best.start != name:
                 colour, shown, width = OTHER_COLOUR, OTHER_STARTS, OTHER_WIDTH
         if name == WANTED:
@@ -246,7 +245,7 @@ class LiveShow:
         share = self._updates % UPDATES_PER_MOTION / UPDATES_PER_MOTION
         self._updates += 1
         log_pose(self._rec, self._model, ROBOT, poses, round(share * (len(rows) - 1)))
-        log_end_path(self._rec, ROBOT, poses, end_point(self._model, poses), STYLE)
+        log_end_path(self._rec, ROBOT, poses, end_point(self._model, poses), DESIGNED)
         _, (positions,) = shown_positions(labels_of_model(self._model), qpos)
         for group, values in (("positions", positions), ("controls", ctrl)):
             for k, (plane, y) in enumerate(zip(self._planes[group], values.T, strict=True)):
@@ -257,7 +256,7 @@ class LiveShow:
         first = BodyPoses(
             t=poses.t[:1], positions=poses.positions[:1], quaternions=poses.quaternions[:1]
         )
-        log_robot(self._rec, self._model, ROBOT, first, STYLE)
+        log_robot(self._rec, self._model, ROBOT, first, DESIGNED)
         self._camera = place_camera(self._model, [poses], 1, ASPECT_WITH_TEXT, follow=False)
         labels = labels_of_model(self._model)
         self._planes = {

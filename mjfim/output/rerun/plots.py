@@ -10,14 +10,15 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from mjfim.arrays import Array, record
-from mjfim.output.panels import ROLES, SERIES, Axis, Mark, Panel
-from mjfim.output.rerun.scene import EntityParts, entity_path, time_column
-
-# Colours (0..255) of axes, limits and the edges of bands, and of words, before a dark background.
-AXIS_COLOUR, WORD_COLOUR = (150, 150, 150), (205, 205, 205)
-
-# Share of white in the colours of curves that have no role.
-LIGHTER = 0.25
+from mjfim.output.panels import SERIES, Axis, Mark, Panel
+from mjfim.output.rerun.scene import (
+    AXIS_COLOUR,
+    WORD_COLOUR,
+    EntityParts,
+    entity_path,
+    rgb,
+    time_column,
+)
 
 # Largest number of plots on a page of a tab, above each other rather than in two columns, and in a
 # line of the row of a question.
@@ -35,18 +36,6 @@ SHOWN_SHARE = 1.0 / 3.0
 
 # Plots of a group by the name of its tab.
 Tabs = dict[str, list[Panel]]
-
-
-def rgb(role: str) -> tuple[int, int, int]:
-    """Return the colour of a role (0..255), which can be seen before a dark background."""
-    if role in ("text", "white"):
-        return WORD_COLOUR
-    if role in ("muted", "band"):
-        return AXIS_COLOUR
-    red, green, blue = bytes.fromhex(ROLES[role].removeprefix("#"))
-    if role.startswith("series"):
-        red, green, blue = (round(c + LIGHTER * (255 - c)) for c in (red, green, blue))
-    return red, green, blue
 
 
 # ---- tabs

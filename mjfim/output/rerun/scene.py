@@ -15,11 +15,22 @@ import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
 from mjfim.arrays import Array, record
+from mjfim.output.page import MEASURED
+from mjfim.output.panels import ROBOT_ROLES, ROLES
 
 GeomType = mujoco.mjtGeom
 
+# Colours (0..255) of axes, limits and the edges of bands, and of words, before a dark background.
+AXIS_COLOUR, WORD_COLOUR = (150, 150, 150), (205, 205, 205)
+
+# Share of white in the colours of curves that have no role.
+LIGHTER = 0.25
+
 # Surfaces are drawn filled, those of an outlined robot as wire frames.
 SOLID, OUTLINE = rr.components.FillMode.Solid, rr.components.FillMode.MajorWireframe
+
+# Roles of robots that are drawn as pale outlines.
+OUTLINED = (MEASURED, *ROBOT_ROLES)
 
 # Opacity of the meshes of an outlined robot, which have no wire frame.
 OUTLINE_OPACITY = 0.3
@@ -54,37 +65,38 @@ MAX_SQUARES = 64
 DARK_SQUARE = 0.8
 
 
-@record
-class RobotStyle:
-    """Style in which one robot and its curves are drawn.
+def rgb(role: str) -> tuple[int, int, int]:
+    """Return the colour of a role (0..255), which can be seen before a dark background."""
+    if role in ("text", "white"):
+        return WORD_COLOUR
+    if role in ("muted", "band"):
+        return AXIS_COLOUR
+    red, green, blue = bytes.fromhex(ROLES[role].removeprefix("#"))
+    if role.startswith("series"):
+        red, green, blue = (round(c + LIGHTER * (255 - c)) for c in (red, green, blue))
+    return red, green, blue
 
-    Attributes:
-        accent: Accent colour (0..255).
-        outline: True to draw the moving geoms as a pale outline in the accent colour.
+
+def geom_colour(role: str, rgba: Iterable[float], moving: bool) -> list[int]:
+    """Return the colour (0..255, with opacity) in which a geom of a robot is drawn.
+
+    Args:
+        role: Role of the robot; moving geoms of an outlined one are pale.
+        rgba: Colour of the geom in the model (0..1).
+        moving: False for a geom that no joint moves; it is grey.
     """
+    model_rgba = np.fromiter(rgba, dtype=np.float64)
+    alpha = 255.0 * model_rgba[3]
+    accent = np.array(rgb(role), dtype=np.float64)
 
-    accent: tuple[int, int, int]
-    outline: bool = False
-
-    def geom_colour(self, rgba: Iterable[float], moving: bool) -> list[int]:
-        """Return the colour (0..255, with opacity) in which a geom is drawn.
-
-        Args:
-            rgba: Colour of the geom in the model (0..1).
-            moving: False for a geom that no joint moves; it is grey.
-        """
-        model_rgba = np.fromiter(rgba, dtype=np.float64)
-        alpha = 255.0 * model_rgba[3]
-        accent = np.array(self.accent, dtype=np.float64)
-
-        if not moving:
-            colour = np.full(3, 255.0 * float(model_rgba[:3] @ BRIGHTNESS_WEIGHTS))
-        elif self.outline:
-            colour = (1.0 - OUTLINE_WHITE) * accent + OUTLINE_WHITE * 255.0
-            alpha *= OUTLINE_OPACITY
-        else:
-            colour = TINT * accent + (1.0 - TINT) * 255.0 * model_rgba[:3]
-        return [round(channel) for channel in (*colour, alpha)]
+    if not moving:
+        colour = np.full(3, 255.0 * float(model_rgba[:3] @ BRIGHTNESS_WEIGHTS))
+    elif role in OUTLINED:
+        colour = (1.0 - OUTLINE_WHITE) * accent + OUTLINE_WHITE * 255.0
+        alpha *= OUTLINE_OPACITY
+    else:
+        colour = TINT * accent + (1.0 - TINT) * 255.0 * model_rgba[:3]
+    return [round(channel) for channel in (*colour, alpha)]
 
 
 @record
@@ -139,7 +151,7 @@ def geom_rgba(model: mujoco.MjModel, geom: int) -> tuple[float, ...]:
     return rgba
 
 
-def drawn_shapes(model: mujoco.MjModel, body: int, style: RobotStyle) -> Iterator[DrawnShape]:
+def drawn_shapes(model: mujoco.MjModel, body: int, role: str) -> Iterator[DrawnShape]:
     """Find the shapes that show a body; a moving body without geoms is a stick figure.
 
     Its geoms are those that MuJoCo's viewer shows, or all where these are none.
@@ -147,19 +159,19 @@ def drawn_shapes(model: mujoco.MjModel, body: int, style: RobotStyle) -> Iterato
     Args:
         model: The model.
         body: Number of the body.
-        style: Style in which it is drawn.
+        role: Role of the robot, which has its colour.
 
     Yields:
         The shapes.
     """
     moving = bool(model.body_weldid[body])
-    fill = OUTLINE if style.outline and moving else SOLID
+    fill = OUTLINE if role in OUTLINED and moving else SOLID
     first = int(model.body_geomadr[body])
     every = range(first, first + int(model.body_geomnum[body]))
     visible = [geom for geom in every if geom_rgba(model, geom)[3] > 0.0]
     geoms = [geom for geom in visible if model.geom_group[geom] <= LAST_SHOWN_GROUP] or visible
     for geom in geoms:
-        rgba = style.geom_colour(geom_rgba(model, geom), moving)
+        rgba = geom_colour(role, geom_rgba(model, geom), moving)
         archetype = geom_shape(model, geom, rgba, fill)
         if archetype is None:
             continue
@@ -172,7 +184,7 @@ def drawn_shapes(model: mujoco.MjModel, body: int, style: RobotStyle) -> Iterato
         )
 
     if moving and not geoms:
-        yield from stick_figure(model, body, style.geom_colour(DEFAULT_RGBA, moving), fill)
+        yield from stick_figure(model, body, geom_colour(role, DEFAULT_RGBA, moving), fill)
 
 
 def shape_name(model: mujoco.MjModel, geom: int) -> str:
@@ -495,7 +507,7 @@ def log_robot(
     model: mujoco.MjModel,
     root: EntityParts,
     poses: BodyPoses,
-    style: RobotStyle,
+    role: str,
     *,
     is_ghost: bool = False,
 ) -> None:
@@ -506,7 +518,7 @@ def log_robot(
         model: The model.
         root: Entity of the robot.
         poses: Poses of its bodies.
-        style: Style in which it is drawn.
+        role: Role of the robot, which has its colour.
         is_ghost: Whether it shows moving bodies only, and on this timeline only.
     """
     if is_ghost:
@@ -514,7 +526,7 @@ def log_robot(
     above = {shape_name(model, geom) for geom in planes_above(model, poses)}
     for body in np.flatnonzero(model.body_weldid).tolist() if is_ghost else range(model.nbody):
         parts = body_parts(model, root, body)
-        for shape in drawn_shapes(model, body, style):
+        for shape in drawn_shapes(model, body, role):
             pose = rr.Transform3D(
                 translation=shape.position, quaternion=rerun_quaternion(shape.quaternion)
             )
@@ -540,15 +552,13 @@ def log_robot(
         rec.reset_time()
 
 
-def pale_shapes(
-    model: mujoco.MjModel, root: EntityParts, style: RobotStyle
-) -> dict[str, rrb.Visualizer]:
+def pale_shapes(model: mujoco.MjModel, root: EntityParts, role: str) -> dict[str, rrb.Visualizer]:
     """Return translucent shapes of the moving bodies of a robot, for a view with several robots.
 
     Args:
         model: The model.
         root: Entity of the robot.
-        style: Style in which it is drawn.
+        role: Role of the robot, which has its colour.
 
     Returns:
         The appearance of each shape, by the path of its entity.
@@ -556,7 +566,7 @@ def pale_shapes(
     pale = {}
     for body in np.flatnonzero(model.body_weldid).tolist():
         parts = body_parts(model, root, body)
-        for shape in drawn_shapes(model, body, style):
+        for shape in drawn_shapes(model, body, role):
             pale[entity_path((*parts, shape.name))] = translucent(shape)
     return pale
 
@@ -566,7 +576,7 @@ def log_end_path(
     root: EntityParts,
     poses: BodyPoses,
     end: EndPoint | None,
-    style: RobotStyle,
+    role: str,
     *,
     static: bool = False,
 ) -> None:
@@ -577,13 +587,13 @@ def log_end_path(
         root: Entity of the robot.
         poses: Poses of its bodies.
         end: The end of the robot.
-        style: Style in which it is drawn.
+        role: Role of the robot, which has its colour.
         static: True for all timelines, False for the time that is set.
     """
     if end is not None:
         path = rr.LineStrips3D(
             [poses.world_paths(*end)[:, 0]],
-            colors=[[*style.accent, 255]],
+            colors=[[*rgb(role), 255]],
             radii=rr.Radius.ui_points(PATH_THICKNESS),
         )
         rec.log(entity_path((*root, "path")), path, static=static, strict=True)

@@ -1,13 +1,16 @@
-"""`mjfim list`: list everything that an experiment file can name in a model."""
+"""`mjfim list` and `mjfim validate`: what a model offers, and what an experiment file states."""
 
 from __future__ import annotations
 
+import json
 from fnmatch import fnmatchcase
+from pathlib import Path
 from typing import Annotated, Literal
 
 import typer
 
-from mjfim.cli.common import AsJson, ModelFile, print_result, verb
+import mjfim
+from mjfim.cli.common import AsJson, ModelFile, Verbose, print_result, verb
 from mjfim.errors import ExperimentError
 
 # Kinds of entries, as in `mjfim.records.inventory.KINDS`.
@@ -49,3 +52,32 @@ def list_(
 
     # The user asked for these entries, so the page leaves none out.
     print_result(as_json, inventory.summary(), inventory_page(inventory), verbose=True)
+
+
+@verb()
+def validate(
+    experiment: Annotated[
+        Path | None, typer.Argument(metavar="EXPERIMENT", help="Experiment file (TOML).")
+    ] = None,
+    schema: Annotated[
+        bool,
+        typer.Option("--schema", help="Print the JSON schema of experiment files, for editors."),
+    ] = False,
+    as_json: AsJson = False,
+    verbose: Verbose = False,
+) -> None:
+    """Say whether an experiment file is correct, and what it states."""
+    if schema:
+        from mjfim.experiment.schema import json_schema
+
+        typer.echo(json.dumps(json_schema(), indent=2, ensure_ascii=False))
+        return
+    if experiment is None:
+        raise ExperimentError("validate needs an experiment file, or --schema")
+    read = mjfim.Experiment.from_file(experiment)
+
+    from mjfim.output.pages.files import experiment_page
+    from mjfim.studies.inventory import stated_experiment
+
+    stated = stated_experiment(read)
+    print_result(as_json, stated.summary(), experiment_page(stated), verbose=verbose)
