@@ -165,7 +165,7 @@ def test_python_blocks_run(block: CodeBlock, checkout: Path) -> None:
 )
 def test_shell_blocks_run(path: Path, checkout: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Pictures are made, and not rendered."""
-    monkeypatch.setattr(design_verb, "DEFAULT_SECONDS", 5.0)
+    monkeypatch.setattr(design_verb, "DEFAULT_SECONDS", 2.0)
     for block in runnable(path, "sh"):
         for line, code in commands(block):
             run_line(quicker(line), checkout, code)
