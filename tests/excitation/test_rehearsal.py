@@ -375,8 +375,6 @@ def test_the_first_cure_keeps_other_robots_safe(make: Any, reserve: Any, tmp_pat
         assert all(advised[kind] > share for kind, share in reserve.items())
         experiment = experiment.replace(limits={"reserve": advised})
         design = mjfim.design(experiment, **SETTINGS)
-    elif found := re.search(r"wrong = ([0-9.]+)", cure):
-        robots["wrong"] = float(found[1])
     else:
         assert "--feedback" in cure
         robots["feedback"] = True

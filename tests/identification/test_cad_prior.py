@@ -222,6 +222,5 @@ def test_what_no_recording_shows_stays_as_in_the_model(tmp_path: Path, log: Reco
     assert scipy.linalg.eigh(honest, formal, eigvals_only=True)[0] > 0.5
 
     # Without the prior, such combinations are held and said one by one.
-    free = arm(tmp_path, cad_prior=False).replace(fit={"max_iterations": 3})
-    without = mjfim.identify(free, [log])
+    without = mjfim.identify(arm(tmp_path, cad_prior=False), [log])
     assert without.combinations and without.prior_directions is None

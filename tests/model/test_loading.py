@@ -44,7 +44,6 @@ def test_every_model_has_an_experiment() -> None:
 def test_check_names_the_subject_of_the_example(name: str, tmp_path: Path) -> None:
     experiment = mjfim.Experiment.from_file(design_file(name, tmp_path))
     found = mjfim.check(experiment.replace(rehearsal={"robots": 4}))
-    assert found.findings
     assert np.isfinite(found.self_test.slope)
     assert found.self_test.passed
     acting = found.self_test.acting
