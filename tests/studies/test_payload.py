@@ -178,7 +178,7 @@ def test_true_values_are_inside_the_intervals(tmp_path: Path) -> None:
     """Also that of an inertia which the recordings show."""
     robot, loaded = experiment(tmp_path), experiment(tmp_path, **LOAD, inertia=0.02)
     found = []
-    for seed in range(3):
+    for seed in range(5):
         robots = mjfim.identify(robot, [log(robot, seed)])
         estimate = mjfim.identify_payload(
             robot, [log(loaded, 100 + seed)], body="hand", robot=robots
