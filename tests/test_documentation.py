@@ -26,6 +26,7 @@ from mjfim.cli import design as design_verb
 from mjfim.excitation.evaluation import evaluate_task
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment import System
+from mjfim.studies import first_experiment
 from tests.support import cli
 from tests.support.markdown import CodeBlock, code_blocks, linked_files
 from tests.support.paths import MODELS, ROOT
@@ -165,7 +166,8 @@ def test_python_blocks_run(block: CodeBlock, checkout: Path) -> None:
 )
 def test_shell_blocks_run(path: Path, checkout: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Pictures are made, and not rendered."""
-    monkeypatch.setattr(design_verb, "DEFAULT_SECONDS", 5.0)
+    monkeypatch.setattr(design_verb, "DEFAULT_SECONDS", 2.0)
+    monkeypatch.setattr(first_experiment, "SECONDS", 2.0)
     for block in runnable(path, "sh"):
         for line, code in commands(block):
             run_line(quicker(line), checkout, code)

@@ -26,7 +26,7 @@ def test_a_model_without_joints_is_refused(here: Path) -> None:
 @pytest.mark.slow
 def test_init_reads_a_log_of_another_program(here: Path) -> None:
     """The experiment file reads the log as it is, and the next command fits it."""
-    (recorded,) = logs_of(cart_pendulum(), 0)
+    (recorded,) = logs_of(cart_pendulum(horizon=1.0), 0)
     slide, hinge = recorded.y[:-1, :2].T
     rows = np.column_stack([1e3 * recorded.t[:-1], recorded.ctrl, slide, np.degrees(hinge)])
     lines = ("; ".join(f"{x:.9f}".replace(".", ",") for x in row) for row in rows)

@@ -312,10 +312,10 @@ def test_a_limit_that_the_model_keeps_by_a_hair_is_broken_by_half_of_the_robots(
     page = page_of(design, experiment="robot.toml", design=tmp_path)
     assert "leave the limit on velocity of slide" in page.verdict.sentence
     assert page.verdict.level is Level.BAD and not design.rehearsal.is_safe
-    wide = rehearsed(experiment, design, robots=300, seed=1)
+    wide = rehearsed(experiment, design, robots=120, seed=1)
     states = [looped(theta, design.trajectory.ctrl) for theta in wide.theta[1:]]
     broken = sum(bool((np.abs(each[1:, 2]) > exact).any()) for each in states)
-    assert broken > 50 and 300 - broken == wide.all_kept
+    assert broken > 20 and 120 - broken == wide.all_kept
     cure = next(step for step in page.next_steps if "velocity" in step)
     assert "`[limits] reserve = { velocity = 0." in cure
     assert "DESIGN_FOLDER" not in " ".join(page.next_steps)
@@ -361,8 +361,6 @@ def arm_with(folder: Path, reserve: dict[str, float]) -> Any:
     ("make", "reserve"),
     [
         (cart_with, {}),
-        (cart_with, {"velocity": 0.05}),
-        (arm_with, {}),
         (arm_with, {"velocity": 0.02}),
     ],
 )
@@ -378,8 +376,6 @@ def test_the_first_cure_keeps_other_robots_safe(make: Any, reserve: Any, tmp_pat
         assert all(advised[kind] > share for kind, share in reserve.items())
         experiment = experiment.replace(limits={"reserve": advised})
         design = mjfim.design(experiment, **SETTINGS)
-    elif found := re.search(r"wrong = ([0-9.]+)", cure):
-        robots["wrong"] = float(found[1])
     else:
         assert "--feedback" in cure
         robots["feedback"] = True

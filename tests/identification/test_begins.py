@@ -24,9 +24,9 @@ def experiment() -> mjfim.Experiment:
     return cart_pendulum()
 
 
-def swung(experiment: mjfim.Experiment, seed: int = 1) -> Recording:
+def swung(experiment: mjfim.Experiment, seed: int = 1, rows: int = 600) -> Recording:
     """Six seconds of the motion of the paper."""
-    t = 0.01 * np.arange(600)
+    t = 0.01 * np.arange(rows)
     return mjfim.simulate(experiment, ((1.0 + t / 4.0) * np.sin(2.0 * t))[:, None], seed)
 
 
@@ -88,7 +88,7 @@ def test_a_log_that_begins_elsewhere_and_misfits_is_fitted(
     robot = tmp_path / "robot.xml"
     robot.write_text(text.replace('axis="1 0 0"/>', 'axis="1 0 0" frictionloss="0.5"/>'))
     made = moved(experiment).replace(model=str(robot))
-    estimate = mjfim.identify(experiment, [swung(made)])
+    estimate = mjfim.identify(experiment, [swung(made, rows=300)])
     assert any("does not begin where [initial] says" in each for each in estimate.warnings)
     assert "dry friction of slide" in estimate.causes[0]
 

