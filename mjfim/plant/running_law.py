@@ -28,7 +28,7 @@ velocities, velocities a straight line, so that they depend continuously on the 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -39,6 +39,9 @@ from mjfim.model.control_laws import NUMBERS, ControlLaw, Quantity
 
 # Number of time constants after which a filter has forgotten its beginning to the last digit.
 FORGOTTEN_AFTER = 37.0
+
+# Numbers that commands depend on.
+DECIDING_NUMBERS = ("latency", "time_constant", "acceleration", "jump")
 
 # Value of a column `enable` from which on a law is on.
 ON = 0.5
@@ -195,6 +198,45 @@ class LawCommands:
             ticks: The evaluations.
             memory: What the laws remember at the begin of the curves; None where these begin.
         """
+        # Most simulations of a derivative share inputs and all numbers that commands depend on.
+        # Their commands are computed once.
+        read = sorted({column for law in laws for column in law.columns.values()})
+        deciding = [window[:, :, read], *(getattr(numbers, name) for name in DECIDING_NUMBERS)]
+        if memory is not None:
+            deciding += [memory.reference, memory.profile_velocity]
+        places: dict[bytes, int] = {}
+        place = [
+            places.setdefault(b"".join(part.tobytes() for part in parts), len(places))
+            for parts in zip(*deciding, strict=True)
+        ]
+        first = np.unique(place, return_index=True)[1]
+        distinct = cls._of_distinct(
+            laws,
+            LawNumbers(**{name: getattr(numbers, name)[first] for name in NUMBERS}),
+            window[first],
+            lead,
+            ticks,
+            None if memory is None else memory.of_curves(first),
+        )
+        # Curves are the last axis but one of all arrays.
+        shared: dict[str, Any] = {
+            field.name: np.take(value, place, axis=-2)
+            for field in fields(cls)
+            if isinstance(value := getattr(distinct, field.name), np.ndarray)
+        }
+        return replace(distinct, **shared)
+
+    @classmethod
+    def _of_distinct(
+        cls,
+        laws: Sequence[ControlLaw],
+        numbers: LawNumbers,
+        window: Array,
+        lead: int,
+        ticks: Ticks,
+        memory: LawMemory | None,
+    ) -> LawCommands:
+        """The commands, where each curve has others."""
         columns = _Columns(laws=laws, window=window, lead=lead, ticks=ticks)
         latency = numbers.latency / (ticks.substeps * ticks.timestep)
         shares = filter_shares(numbers.time_constant, ticks.seconds)
@@ -446,6 +488,15 @@ class LawMemory:
     measured: Array
     positions: Array
     velocities: Array
+
+    def of_curves(self, curves: np.ndarray) -> LawMemory:
+        """The memory for some of the curves."""
+        return LawMemory(
+            **{
+                each.name: np.take(getattr(self, each.name), curves, axis=-2)
+                for each in fields(self)
+            }
+        )
 
 
 @record
