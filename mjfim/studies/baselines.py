@@ -21,6 +21,7 @@ from mjfim.excitation.search.inside import LimitedCost, largest_share
 from mjfim.excitation.search.levels import DescentLevel, bandwidth_basis
 from mjfim.excitation.search.search import Search
 from mjfim.excitation.task import DesignTask
+from mjfim.excitation.task_parts import Known
 from mjfim.experiment.schema import Experiment
 from mjfim.parallel import one_blas_thread, pool_stop_token
 from mjfim.parallel.budget import Budget, StopToken
@@ -223,7 +224,7 @@ class BaselineSearch:
         seed: Seed of its random numbers.
         part: Number of this search among those of one baseline, and how many there are.
         combinations: Basis of the identifiable combinations; None where all are identifiable.
-        added_information: (p, p) information of other experiments.
+        added: What other experiments tell, besides the stated `earlier` files.
         threads: Number of threads; None for all.
     """
 
@@ -233,7 +234,7 @@ class BaselineSearch:
     seed: int = 0
     part: tuple[int, int] = (0, 1)
     combinations: Array | None = None
-    added_information: Array | None = None
+    added: Known | None = None
     threads: int | None = None
 
 
@@ -268,9 +269,7 @@ def run_baseline(
         stop: Ends the search early; None for the request of the pool of this process.
     """
     budget = Budget(seconds=search.seconds, stop=stop or pool_stop_token())
-    task = DesignTask.resolve(
-        search.experiment, threads=search.threads, added_information=search.added_information
-    )
+    task = DesignTask.resolve(search.experiment, threads=search.threads, added=search.added)
     found, steps = METHODS[search.method](search, task, budget, callback or (lambda cost: None))
     return replace(found, seconds=budget.seconds_used, steps=steps)
 

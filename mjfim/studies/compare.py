@@ -103,7 +103,7 @@ def compare(
         seconds=seconds,
         seed=seed,
         combinations=evaluation.stage.basis,
-        added_information=task.added_information,
+        added=task.added,
         threads=task.system.threads,
     )
 
@@ -262,7 +262,7 @@ class _MethodRun:
             task = DesignTask.resolve(
                 stated,
                 threads=self.search.threads,
-                added_information=self.search.added_information,
+                added=self.search.added,
             )
             design = design_task(
                 task,

@@ -200,7 +200,6 @@ def test_numbers_of_a_driver_are_missing_terms(name: str, value: float) -> None:
 
     problem = FitProblem.of(System.resolve(closed_loop()), [log])
     at = least_squares(problem, problem.system.parameters.guess).unknowns
-    first = find_missing_terms(problem, [log], at).terms[0]
 
     # A filter and a latency of the same delay explain the data about equally well.
     likely = {term.path: term for term in find_missing_terms(problem, [log], at).likely}
