@@ -391,7 +391,7 @@ class GeomDistances:
         # smallest distance found: no later pair can be nearer.
         for place in np.argsort(bounds, axis=None).tolist():
             k, p = divmod(place, len(self.pairs))
-            distance = float(bounds[k, p])
+            distance = bounds[k, p]
             if distance >= best:
                 break
             if not self._exact[p]:
