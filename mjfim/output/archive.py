@@ -20,6 +20,7 @@ import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.errors import RecordingError, SimulationDivergedError
+from mjfim.experiment.given import check_fits
 from mjfim.experiment.system import System
 from mjfim.files import read_arrays, relative_name, replacing, write_json
 from mjfim.model.coordinates import (
@@ -301,7 +302,7 @@ def write_recording(path: Path, recording: Recording, system: System) -> None:
     write_table(path, {"t": recording.t, **controls, **outputs})
 
 
-def read_design(path: Path) -> dict[str, Trajectory]:
+def read_design(path: Path, system: System) -> dict[str, Trajectory]:
     """Read the trajectories of a design.npz.
 
     The file may come from any version of mjfim or from another program. `Design.load` reads the
@@ -309,13 +310,14 @@ def read_design(path: Path) -> dict[str, Trajectory]:
 
     Args:
         path: The npz file.
+        system: The experiment.
 
     Returns:
         The designed trajectory as `final`, and the initial one as `initial` if the file holds it.
 
     Raises:
         RecordingError: The file cannot be read, lacks an array, or its arrays do not fit each
-            other. Pickles are refused.
+            other or the experiment. Pickles are refused.
     """
     arrays = read_arrays(path, "design")
     missing = [key for key in TRAJECTORY_ARRAYS if key not in arrays]
@@ -323,8 +325,11 @@ def read_design(path: Path) -> dict[str, Trajectory]:
         expected = ", ".join((*TRAJECTORY_ARRAYS, "gain", "sensitivity"))
         raise RecordingError(f"{path}: array {missing[0]!r} is missing; a design holds {expected}")
     has_initial = all(f"initial_{key}" in arrays for key in TRAJECTORY_ARRAYS)
-    initial = {"initial": _trajectory(path, "initial_", arrays)} if has_initial else {}
-    return {**initial, "final": _trajectory(path, "", arrays)}
+    prefixes = {"initial": "initial_", "final": ""} if has_initial else {"final": ""}
+    named = {name: _trajectory(path, prefix, arrays) for name, prefix in prefixes.items()}
+    for trajectory in named.values():
+        check_fits(path, trajectory, system)
+    return named
 
 
 def _trajectory(path: Path, prefix: str, arrays: Mapping[str, np.ndarray]) -> Trajectory:

@@ -17,10 +17,9 @@ from mjfim.experiment.arguments import checked
 from mjfim.experiment.schema import ExperimentLike
 from mjfim.experiment.system import System, labels_of_model
 from mjfim.output.archive import shown_positions
-from mjfim.output.live import live_system
+from mjfim.output.live import design_stage, design_text, live_system, progress_line
 from mjfim.output.page import DESIGNED, IDENTIFIED, INITIAL, MEASURED, NOMINAL, OTHER
 from mjfim.output.panels import line
-from mjfim.output.progress_text import design_stage, design_text, progress_line
 from mjfim.output.rerun.camera import Camera, place_camera
 from mjfim.output.rerun.documents import (
     ASPECT_WITH_TEXT,
