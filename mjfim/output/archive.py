@@ -346,11 +346,16 @@ def _trajectory(path: Path, prefix: str, arrays: Mapping[str, np.ndarray]) -> Tr
                 f"has the shape {array.shape}"
             )
 
-    periods = np.diff(found["t"].astype(np.float64))
-    mean = float(periods.mean())
+    _require_equal_periods(f"{path}: array '{prefix}t'", found["t"].astype(np.float64))
+    return Trajectory(**found)
+
+
+def _require_equal_periods(name: str, t: Array) -> None:
+    """Raise RecordingError where times do not increase by equal periods."""
+    periods = np.diff(t)
+    mean = periods.mean()
     if mean <= 0.0 or np.abs(periods - mean).max() > SPACING_TOLERANCE * mean:
         raise RecordingError(
-            f"{path}: array '{prefix}t' must increase by equal periods; they are "
-            f"{periods.min():g} s to {periods.max():g} s"
+            f"{name} must increase by equal periods; they are {periods.min():g} s to "
+            f"{periods.max():g} s"
         )
-    return Trajectory(**found)

@@ -125,22 +125,22 @@ def _verdict_on_fit(estimate: Estimate) -> Verdict:
         return Verdict(f"These estimates are not reliable: {why}.", Level.BAD)
     # A search that is stopped early has not tried all that may explain the recordings.
     if estimate.interrupted:
-        text = (
+        return Verdict(
             "Interrupted: the estimates are the best ones that were found until then, and the "
-            f"residuals are {ratio:.2f} times the noise."
+            f"residuals are {ratio:.2f} times the noise.",
+            Level.DOUBTFUL,
         )
-        return Verdict(text, Level.DOUBTFUL)
     model = "The model"
     if estimate.selection is not None and estimate.selection.terms:
         terms = first_ones([term.description for term in estimate.selection.terms])
         model = f"With {terms} added, the model"
     if estimate.misfit:
         size = f"the residuals are {ratio:.2f} times the noise"
-        text = (
+        return Verdict(
             f"{model} does not explain the recordings: {'; '.join(estimate.reasons) or size}. "
-            "The true errors may exceed the intervals."
+            "The true errors may exceed the intervals.",
+            Level.DOUBTFUL,
         )
-        return Verdict(text, Level.DOUBTFUL)
     text = f"{model} explains the recordings: the residuals are {ratio:.2f} times the noise"
     if is_larger_than_noise(estimate.chi2, estimate.dof):
         text = (

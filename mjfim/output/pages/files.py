@@ -16,6 +16,7 @@ from mjfim.output.page import (
     Table,
     named,
     number,
+    numbers,
 )
 from mjfim.recordings.read import ColumnSummary, LogSummary
 from mjfim.records.base import Level, Verdict
@@ -65,10 +66,7 @@ def inventory_page(inventory: Inventory) -> Page:
             "Keyframes: names for `initial.keyframe`",
             "name, qpos, ctrl",
             [
-                (
-                    k.name or "(no name)",
-                    *(" ".join(f"{x:.4g}" for x in v) for v in (k.qpos, k.ctrl)),
-                )
+                (k.name or "(no name)", " ".join(numbers(k.qpos, 4)), " ".join(numbers(k.ctrl, 4)))
                 for k in inventory.keyframes
             ],
         ),
@@ -86,8 +84,12 @@ def inventory_page(inventory: Inventory) -> Page:
             [(t.kind, ", ".join(t.elements), ", ".join(t.fields)) for t in inventory.terms],
         ),
     )
-    remarks = [Listing("Remarks", inventory.remarks)] if inventory.remarks else []
-    return _page(inventory.model, "", tables, remarks)
+    return _page(
+        inventory.model,
+        "",
+        tables,
+        [Listing("Remarks", inventory.remarks)] if inventory.remarks else [],
+    )
 
 
 def _known(value: float | None) -> str:

@@ -288,17 +288,19 @@ class LiveShow:
             (robot,) = robot_views(self._model, self._camera, {"best iterate so far": ROBOT})
             over_events = rrb.Grid(*plots, grid_columns=2)
             left = rrb.Vertical(robot, over_events, progress, row_shares=LEFT_HEIGHTS)
-            tabs = [
-                tab
-                for group, planes in self._planes.items()
-                for tab in grid_tabs(group, [plane.view() for plane in planes])
-            ]
-            layout = rrb.Horizontal(
-                left, rrb.Tabs(*tabs, active_tab=0), column_shares=LEFT_TO_RIGHT
-            )
+            layout = rrb.Horizontal(left, self._curves_of_best(), column_shares=LEFT_TO_RIGHT)
         timeline = STREAM_TIMELINE if Watch in self._kinds else TIMELINE
         panel = rrb.TimePanel(state="collapsed", timeline=timeline, play_state="following")
         self._rec.send_blueprint(blueprint_of(layout, panel), make_active=True, make_default=True)
+
+    def _curves_of_best(self) -> rrb.Tabs:
+        """Return tabs with the positions and the controls of the best motion."""
+        tabs = [
+            tab
+            for group, planes in self._planes.items()
+            for tab in grid_tabs(group, [plane.view() for plane in planes])
+        ]
+        return rrb.Tabs(*tabs, active_tab=0)
 
 
 def _rank(row: HistoryRow) -> tuple[float, bool, float]:
