@@ -31,41 +31,29 @@ TIE_TOLERANCE = 2e-2
 MAX_MOTIONS, MOTION_SAMPLES = 40, 200
 
 
-@record
-class IterateMotion(Record):
-    """Motion of one iterate at `MOTION_SAMPLES` evenly spread samples, n in all.
+# Motion of one iterate at `MOTION_SAMPLES` evenly spread samples: (n,) times [s], (n, nq) positions
+# [m or rad; unit quaternions for ball and free joints], and (n, nu) controls, of which the last one
+# is repeated at the end [unit of the actuator].
+IterateMotion = tuple[Array, Array, Array]
 
-    Attributes:
-        t: (n,) times [s].
-        qpos: (n, nq) positions [m or rad; unit quaternions for ball and free joints].
-        ctrl: (n, nu) controls; the last one is repeated at the end [unit of the actuator].
+
+def iterate_motion(trajectory: Trajectory | None) -> IterateMotion | None:
+    """Thin the trajectory of an iterate.
+
+    Args:
+        trajectory: The trajectory; None for an iterate whose simulation diverged.
+
+    Returns:
+        The motion; None without a trajectory, and where it is not finite.
     """
+    if trajectory is None or not np.isfinite(trajectory.qpos).all():
+        return None
 
-    t: Array
-    qpos: Array
-    ctrl: Array
-
-    @classmethod
-    def of(cls, trajectory: Trajectory | None) -> IterateMotion | None:
-        """Thin a trajectory.
-
-        Args:
-            trajectory: The trajectory; None for an iterate whose simulation diverged.
-
-        Returns:
-            The motion; None without a trajectory, and where it is not finite.
-        """
-        if trajectory is None or not np.isfinite(trajectory.qpos).all():
-            return None
-
-        # A trajectory with fewer samples repeats some, so that all motions have the same size.
-        last = trajectory.samples
-        rows = np.linspace(0, last, MOTION_SAMPLES).round().astype(np.intp)
-        return cls(
-            t=_drawn(trajectory.t[rows]),
-            qpos=_drawn(trajectory.qpos[rows]),
-            ctrl=_drawn(trajectory.ctrl[np.minimum(rows, last - 1)]),
-        )
+    # A trajectory with fewer samples repeats some, so that all motions have the same size.
+    last = trajectory.samples
+    rows = np.linspace(0, last, MOTION_SAMPLES).round().astype(np.intp)
+    ctrl = trajectory.ctrl[np.minimum(rows, last - 1)]
+    return _drawn(trajectory.t[rows]), _drawn(trajectory.qpos[rows]), _drawn(ctrl)
 
 
 def _drawn(values: Array) -> Array:
@@ -103,13 +91,9 @@ class IterateMotions(Record):
         """
         if not motions:
             return None
-        return cls(
-            iteration=np.array([iteration for iteration, _ in motions], dtype=np.float64),
-            **{
-                name: np.stack([getattr(motion, name) for _, motion in motions])
-                for name in ("t", "qpos", "ctrl")
-            },
-        )
+        t, qpos, ctrl = map(np.stack, zip(*(motion for _, motion in motions), strict=True))
+        iterations = np.array([iteration for iteration, _ in motions], dtype=np.float64)
+        return cls(iteration=iterations, t=t, qpos=qpos, ctrl=ctrl)
 
 
 # When a controller should use the gains, for design.json and the player.

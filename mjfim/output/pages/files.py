@@ -50,7 +50,7 @@ def inventory_page(inventory: Inventory) -> Page:
         _table(
             "Parameters: paths for `target`",
             "path, value, unit",
-            [(p.path, _known(p.value), p.unit) for p in inventory.parameters],
+            [(path, _known(value), unit) for path, value, unit in inventory.parameters],
         ),
         _table(
             "Outputs: names for `[noise]` and for columns of recordings",
@@ -60,7 +60,7 @@ def inventory_page(inventory: Inventory) -> Page:
         _table(
             "Actuators: names for `initial.control` and columns of controls",
             "name, drives, unit of the control",
-            [(a.name, a.drives, a.unit) for a in inventory.actuators],
+            inventory.actuators,
         ),
         _table(
             "Keyframes: names for `initial.keyframe`",

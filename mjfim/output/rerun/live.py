@@ -229,10 +229,7 @@ class LiveShow:
             return
         self._is_shown = True
         self._rec.set_time(TIMELINE, sequence=self._events - 1)
-        motion = best.row.motion
-        t, qpos, ctrl = (
-            np.asarray(each, dtype=np.float64) for each in (motion.t, motion.qpos, motion.ctrl)
-        )
+        t, qpos, ctrl = best.row.motion
         rows = evenly_spread_indices(len(t), MOTION_SAMPLES)
         if not np.isfinite(qpos[rows]).all():
             return
