@@ -10,7 +10,7 @@ import numpy as np
 from mjfim.arrays import NORMAL_95, Array, finite_or_nan, record
 from mjfim.errors import first_ones, shortened
 from mjfim.records.base import ParameterResult, ParameterValue, Record, no_array
-from mjfim.records.design import CombinationAccuracy, LimitViolation
+from mjfim.records.design import LimitViolation
 from mjfim.records.rehearsal import FiniteSteps, Rehearsal, Valley
 from mjfim.records.worth import Worth
 
@@ -262,8 +262,7 @@ class Check(ParameterResult):
             well, and for recordings.
         is_start: Whether the motion is the initial control, at which a design begins.
         findings: What the check found, in sentences, the most serious first.
-        combined: Accuracies of the identifiable combinations; their `std_initial` and `std_final`
-            are equal.
+        combined: The identifiable combinations; their `std_initial` and `std` are equal.
         missing: What was not computed because the check was stopped, in words; empty where it is
             complete.
         refused: Reasons why `mjfim design` refuses the experiment, in its own words.
@@ -288,7 +287,7 @@ class Check(ParameterResult):
     worth: Worth | None = None
     valley: Valley | None = None
     is_start: bool = False
-    combined: tuple[CombinationAccuracy, ...] = ()
+    combined: tuple[ParameterValue, ...] = ()
     missing: tuple[str, ...] = ()
     refused: tuple[str, ...] = ()
     violations: tuple[LimitViolation, ...] = ()
@@ -380,9 +379,7 @@ class Check(ParameterResult):
 
     def summary(self) -> dict[str, Any]:
         """The contents of the record in JSON."""
-        combined = [
-            {"words": c.expression, "value": c.value, "std": c.std_final} for c in self.combined
-        ]
+        combined = [{"words": c.name, "value": c.value, "std": c.std} for c in self.combined]
         return {
             **super().summary(),
             "complete": not self.missing,

@@ -631,17 +631,15 @@ def _scaled_sentence(design: Design, scaled: ScaledStart) -> str:
 
 def _accuracy_table(design: Design) -> Table:
     """Tabulate the predicted standard deviations before and after a design."""
-    wanted, combined = list(design.wanted), design.combined
-    units = design.labels.parameter_units
-    names = [named(design.parameters[j], units[j]) for j in wanted]
-    values = [*design.theta[wanted], *(each.value for each in combined)]
+    wanted, combined, rows = list(design.wanted), design.combined, design.rows
     sizes = [*design.sizes[wanted], *(abs(each.value) for each in combined)]
-    before = [*design.initial.std[wanted], *(each.std_initial for each in combined)]
-    after = [*design.stated_std[wanted], *(each.std_final for each in combined)]
+    values = [each.value for each in rows]
+    before = [each.further["std_initial"] for each in rows]
+    after = [each.std for each in rows]
     return tabulated(
         "Predicted standard deviation σ of each parameter after one experiment",
         {
-            "parameter": [*names, *(each.expression for each in combined)],
+            "parameter": [named(each.name, each.unit) for each in rows],
             "value": numbers(values, 4),
             "σ initial": numbers(before, infinite=NOT_ALONE),
             "relative σ initial": list(map(relative, before, sizes)),
@@ -826,9 +824,7 @@ def _row(row: ParameterCheck) -> Row:
 
 def _groups(title: str, groups: tuple[ParameterGroup, ...], check: Check) -> Iterator[Part]:
     """Groups of parameters, with a line per combination, its value and its σ."""
-    accuracy = {
-        each.expression: f" = {each.value:.4g} ± {each.std_final:.2g}" for each in check.combined
-    }
+    accuracy = {each.name: f" = {each.value:.4g} ± {each.std:.2g}" for each in check.combined}
     items = []
     for group in groups:
         combinations = [" ".join(combination_terms(each)) for each in group.combinations]

@@ -51,7 +51,7 @@ from mjfim.output.words import (
     when_learnt,
 )
 from mjfim.records.design import Design, LimitUsage
-from mjfim.records.trajectory import Labels, Trajectory
+from mjfim.records.trajectory import Labels, Trajectory, with_unit
 from mjfim.records.worth import SensorWorth, Worth
 
 # Number of turning points above which a curve would be a solid area; its envelope is drawn instead.
@@ -302,11 +302,11 @@ def _history_marks(iterations: Array, values: Array, begin: str) -> list[Mark]:
 
 def accuracy(design: Design, labels: Labels) -> Picture:
     """Show the predicted standard deviations of both trajectories in percent, and wanted ones."""
-    wanted, combined = list(design.wanted), design.combined
-    names = [labels.parameter(j) for j in wanted] + [each.expression for each in combined]
+    wanted, combined, rows = list(design.wanted), design.combined, design.rows
+    names = [with_unit(each.name, each.unit) for each in rows]
     sizes = np.array([*design.shares[wanted], *(abs(each.value) or np.nan for each in combined)])
-    before = np.array([*design.initial.std[wanted], *(each.std_initial for each in combined)])
-    after = np.array([*design.stated_std[wanted], *(each.std_final for each in combined)])
+    before = np.array([each.further["std_initial"] for each in rows])
+    after = np.array([each.std for each in rows])
     goal = np.array([*labels.wanted[wanted], *[np.inf] * len(combined)])
     first = Accuracies(before, INITIAL, INITIAL, size=10.0, hollow=True)
     panel = accuracy_panel(names, sizes, [first, Accuracies(after, DESIGNED, DESIGNED)], goal)

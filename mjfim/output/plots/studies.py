@@ -68,7 +68,8 @@ from mjfim.output.words import (
     squared_unit,
     without_zeros,
 )
-from mjfim.records.check import CONFOUNDED_CORRELATION, Check
+from mjfim.records.base import ParameterValue
+from mjfim.records.check import CONFOUNDED_CORRELATION, Check, ParameterCheck
 from mjfim.records.rehearsal import MAX_PATHS, Rehearsal, Separation, Valley
 from mjfim.records.robots import RobotComparison
 from mjfim.records.studies import (
@@ -123,9 +124,10 @@ def check(result: Check) -> Picture:
     """Show predicted and wanted relative standard deviations, and correlations of the estimates."""
     rows = [row for row in result.rows if not row.nuisance]
     combined = result.combined
-    names = [with_unit(row.name, row.unit) for row in rows] + [each.expression for each in combined]
-    std = np.array([*(row.std for row in rows), *(each.std_final for each in combined)])
-    values = np.array([*(row.value for row in rows), *(each.value for each in combined)])
+    both: list[ParameterCheck | ParameterValue] = [*rows, *combined]
+    names = [with_unit(row.name, row.unit) for row in both]
+    std = np.array([row.std for row in both])
+    values = np.array([row.value for row in both])
     sizes = np.array([*(row.size for row in rows), *(abs(each.value) for each in combined)])
     goals = np.array([*(row.wanted for row in rows), *[np.inf] * len(combined)])
     label = f"predicted, {result.source} ({duration(result)})"
