@@ -378,7 +378,7 @@ def selection_parts(selection: Selection) -> Sequence[Part]:
         if step.alternatives and step.path in kept
     ]
     if selection.refit is not None:
-        differs = selection.refit.differs
+        differs = selection.refit[2]
         same = "the same parameters within the intervals."
         other = (
             f"other values of {listed(differs)}, by more than both intervals explain; the "
