@@ -153,11 +153,13 @@ def replay(
         rerun.log_trajectories(
             target, system.model_at(system.theta), named, labels_of_system(system)
         )
-    elif save is None:
-        target = find_rerun_file(source)
     else:
-        with replacing(save) as temporary:
-            shutil.copyfile(find_rerun_file(source), temporary)
+        found = find_rerun_file(source)
+        if save is None:
+            target = found
+        else:
+            with replacing(save) as temporary:
+                shutil.copyfile(found, temporary)
     if save is None:
         rerun.show(target)
     else:

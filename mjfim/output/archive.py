@@ -164,12 +164,7 @@ def reference_columns(playback: Trajectory, system: System) -> dict[str, Array]:
     for k, data in forward_samples(system.model_at(system.theta), rows, range(len(held))):
         force[k] = data.qfrc_actuator
 
-    # The changes of the velocity over single engine steps.
-    steps = system.stated_grid.playback_steps
-    states = _rollout(system, playback.state[:1], np.repeat(playback.ctrl, steps, axis=0), 1)
-    change = np.diff(system.space.split(states)[1], axis=0) / float(system.model.opt.timestep)
-    qacc = np.concatenate([change[::steps], change[-1:]])
-
+    qacc = _accelerations(playback, system)
     names = [component.name for component in state_components(system.model)]
     dofs = dof_names(system.model)
     columns = {"t": playback.t}
@@ -177,6 +172,14 @@ def reference_columns(playback: Trajectory, system: System) -> dict[str, Array]:
     columns |= dict(zip(names, planned.T, strict=True))
     columns |= {f"qacc:{name}": qacc[:, i] for i, name in enumerate(dofs)}
     return columns | {f"force:{name}": force[:, i] for i, name in enumerate(dofs)}
+
+
+def _accelerations(playback: Trajectory, system: System) -> Array:
+    """(M+1, nv) changes of the velocity over single engine steps, divided by the timestep."""
+    steps = system.stated_grid.playback_steps
+    states = _rollout(system, playback.state[:1], np.repeat(playback.ctrl, steps, axis=0), 1)
+    change = np.diff(system.space.split(states)[1], axis=0) / float(system.model.opt.timestep)
+    return np.concatenate([change[::steps], change[-1:]])
 
 
 def _rollout(system: System, start: Array, ctrl: Array, steps: int) -> Array:

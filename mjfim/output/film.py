@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 import platform
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import field, replace
 from importlib import import_module
 from importlib.util import find_spec
@@ -508,17 +508,8 @@ class Painter:
         """What is equal in all frames: the titles and the speed."""
         paper = Image.new("RGB", (self.width, self.height), PAPER)
         text = ImageDraw.Draw(paper)
-        bold, plain = _font("DejaVuSans-Bold.ttf", TITLE_SIZE), _font("DejaVuSans.ttf", TITLE_SIZE)
         for k, named in enumerate(self._film.named):
-            x = float(k * (self._film.size[0] + GAP) + MARGIN)
-            for j, (term, is_ghost) in enumerate(named.items()):
-                words = [(" and " if j else "", FAINT_INK, plain), (term, term.rgb, bold)]
-                # Of three words, there is no room for more.
-                is_told = is_ghost and len(named) == 2
-                words.append((" (transparent)" if is_told else "", FAINT_INK, plain))
-                for word, colour, font in words:
-                    text.text((x, TITLE_HEIGHT // 2), word, colour, font, anchor="lm")
-                    x += font.getlength(word)
+            _write_title(text, float(k * (self._film.size[0] + GAP) + MARGIN), named)
 
         place = (self.width - MARGIN, self.height - FOOT_HEIGHT // 2)
         text.text(place, self._film.speed_text, FAINT_INK, self._font, anchor="rm")
@@ -603,6 +594,19 @@ class Painter:
         turn = np.stack([np.cross(forward, up), up, -forward], axis=1)
         size = distance * np.array([2.0, 2.0, 1e-3])
         _add_box(scene, size, position + distance * forward, turn, BACKGROUND)
+
+
+def _write_title(text: ImageDraw.ImageDraw, x: float, named: Mapping[Term, bool]) -> None:
+    """Write the words of the robots of a view from a place on, and which robots are ghosts."""
+    bold, plain = _font("DejaVuSans-Bold.ttf", TITLE_SIZE), _font("DejaVuSans.ttf", TITLE_SIZE)
+    for j, (term, is_ghost) in enumerate(named.items()):
+        words = [(" and " if j else "", FAINT_INK, plain), (term, term.rgb, bold)]
+        # Of three words, there is no room for more.
+        is_told = is_ghost and len(named) == 2
+        words.append((" (transparent)" if is_told else "", FAINT_INK, plain))
+        for word, colour, font in words:
+            text.text((x, TITLE_HEIGHT // 2), word, colour, font, anchor="lm")
+            x += font.getlength(word)
 
 
 # Red, green, blue and opacity (0..1).

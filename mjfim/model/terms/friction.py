@@ -483,12 +483,7 @@ class LoadDependentFriction(Term):
         base = spec.worldbody if self.base == WORLD else spec.body(self.base)
         for side, place in zip(SIDES, self.buffers, strict=True):
             self._add_sphere(base, side).pos = place
-            pair = spec.add_pair(name=f"{self.name}_{side}")
-            pair.geomname1, pair.geomname2 = f"{self.name}_ball", f"{self.name}_{side}"
-            pair.condim = 4
-            pair.friction = [0.0, 0.0, self.radius * self.value("coefficient"), 0.0, 0.0]
-            pair.solref = [CONTACT_TIME * spec.option.timestep, 1.0]
-            pair.solimp = IMPEDANCE
+            self._add_contact(spec, side)
 
         tendon = spec.add_tendon(name=self.name)
         tendon.wrap_joint(self.joint, 1.0)
@@ -503,6 +498,18 @@ class LoadDependentFriction(Term):
         geom.group = HIDDEN_GROUP
         geom.rgba = np.zeros(4)
         return geom
+
+    def _add_contact(self, spec: Any, side: str) -> None:
+        """Add the contact of the ball with a buffer, whose torsional friction is the term."""
+        spec.add_pair(
+            name=f"{self.name}_{side}",
+            geomname1=f"{self.name}_ball",
+            geomname2=f"{self.name}_{side}",
+            condim=4,
+            friction=[0.0, 0.0, self.radius * self.value("coefficient"), 0.0, 0.0],
+            solref=[CONTACT_TIME * spec.option.timestep, 1.0],
+            solimp=IMPEDANCE,
+        )
 
 
 def _driven_hinge(model: Any, name: str, actuator: int) -> int:

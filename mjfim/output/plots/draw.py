@@ -409,6 +409,11 @@ def _draw_cells(axes: Axes, cells: Cells) -> None:
     if cells.scale is not None:
         bar = axes.figure.colorbar(image, ax=axes, shrink=0.8, pad=0.015, aspect=30)
         bar.set_ticks(list(cells.scale[0]), labels=list(cells.scale[1]))
+    _write_cells(axes, cells)
+
+
+def _write_cells(axes: Axes, cells: Cells) -> None:
+    """Write the words of cells, white ones into dark cells."""
     for i, row in enumerate(cells.texts):
         for j, text in enumerate(row):
             is_dark = abs(cells.values[i, j] - cells.middle) > DARK_CELL * cells.reach

@@ -477,13 +477,21 @@ def _robots(
     separate = arranged(*robot_views(model, camera, titles), name="separate")
     if len(names) < 2:
         return separate
-    pale: dict[str, rrb.Visualizer] = {}
-    for name in names[:-1]:
-        pale |= pale_shapes(model, ("robots", name), (roles or {}).get(name, name))
     # The camera of a view that is opened later, while a body flies, would begin in a wrong place.
     still = place_camera(model, motions, views=1, aspect=aspect, follow=False)
+    pale = _pale_robots(model, names[:-1], roles or {})
     (overlay,) = robot_views(model, still, {"overlay": ("robots",)}, overrides=pale)
     return rrb.Tabs(separate, overlay, active_tab=0)
+
+
+def _pale_robots(
+    model: mujoco.MjModel, names: Sequence[str], roles: Mapping[str, str]
+) -> dict[str, rrb.Visualizer]:
+    """Return the translucent look of robots, by the paths of their shapes."""
+    pale: dict[str, rrb.Visualizer] = {}
+    for name in names:
+        pale |= pale_shapes(model, ("robots", name), roles.get(name, name))
+    return pale
 
 
 def _log_robots(

@@ -145,8 +145,8 @@ class LiveShow:
             self._show_best()
 
     def _take(self, event: Event) -> None:
+        self._rec.set_time(TIMELINE, sequence=self._events)
         self._events += 1
-        self._rec.set_time(TIMELINE, sequence=self._events - 1)
         result = event.result if isinstance(event, StudyEvent) else None
         kind = Watch if isinstance(result, Watch) else type(event)
         if kind not in self._kinds:
@@ -160,15 +160,19 @@ class LiveShow:
             self._add("squares", event.phase, _logarithm(event.cost))
             self._add("step", event.phase, _logarithm(event.step))
         elif isinstance(result, Watch):
-            self._rec.set_time(STREAM_TIMELINE, duration=result.seconds)
-            self._add("accuracy", WANTED, 0.0)
-            for j in result.asked.tolist():
-                share = float(result.std[j] / result.wanted[j])
-                self._add("accuracy", result.parameters[j], _logarithm(share))
-        elif event.count is not None:
-            share = (event.index + event.share) / max(event.count, 1)
+            self._add_accuracy(result)
+        elif event.count:
+            share = (event.index + event.share) / event.count
             self._add("share", event.study, 100.0 * share)
         self._show_text(_text_of(event, self._best))
+
+    def _add_accuracy(self, watch: Watch) -> None:
+        """Add σ over its wanted value of each parameter, on the timeline of the stream."""
+        self._rec.set_time(STREAM_TIMELINE, duration=watch.seconds)
+        self._add("accuracy", WANTED, 0.0)
+        for j in watch.asked.tolist():
+            share = float(watch.std[j] / watch.wanted[j])
+            self._add("accuracy", watch.parameters[j], _logarithm(share))
 
     def end(self) -> None:
         """Show the best motion, and close the connection."""
