@@ -291,6 +291,14 @@ def _separation(
 
 # ---- comparison of methods
 
+# What stands beside the standard deviations: margins, if there are limits.
+BESIDE_STD = {
+    True: "the smallest margin of all limits, as a share of half of the limit's range, and its "
+    "kind; negative: the limit is violated.",
+    False: "J, which also weighs the effort of the control: without limits, more effort buys a "
+    "smaller σ.",
+}
+
 
 def compare(comparison: Comparison) -> Picture:
     """Show standard deviations over the design's (cells), and the worst combination (bars)."""
@@ -298,31 +306,26 @@ def compare(comparison: Comparison) -> Picture:
         comparison.rows, key=lambda row: (not row.sound, np.nan_to_num(row.cost, nan=np.inf))
     )
     roles = [_method_role(comparison, row) for row in rows]
-    names = [comparison.parameters[j] for j in comparison.wanted]
     methods = row_axis(
         [row.title for row in rows],
         [role if row.sound else "muted" for role, row in zip(roles, rows, strict=True)],
     )
     first, *others = comparison.findings
     has_margins = any(row.tightest[0] for row in rows)
-    beside = (
-        "the smallest margin of all limits, as a share of half of the limit's range, and its kind; "
-        "negative: the limit is violated."
-        if has_margins
-        else "J, which also weighs the effort of the control: without limits, more effort buys a "
-        "smaller σ."
+    note = (
+        f"{' '.join(others)} Each method had {budget_in_words(comparison)}. "
+        "Predicted standard deviations are the best case. Sorted by the cost J, best first. "
+        f"Beside σ: {BESIDE_STD[has_margins]}"
     )
     return Picture(
         title=first.removesuffix("."),
         panels=[
-            _ratios(comparison, rows, names, methods),
+            _ratios(comparison, rows, methods),
             _worst_combinations(comparison, rows, roles, has_margins=has_margins),
         ],
-        note=f"{' '.join(others)} Each method had {budget_in_words(comparison)}. "
-        "Predicted standard deviations are the best case. Sorted by the cost J, best first. "
-        f"Beside σ: {beside}",
+        note=note.strip(),
         heights=[np.clip(1.2 + 0.36 * len(rows), 2.2, 11.0)],
-        widths=[np.clip(0.55 * len(names), 2.2, 9.0), 3.6],
+        widths=[np.clip(0.55 * len(comparison.wanted), 2.2, 9.0), 3.6],
     )
 
 
@@ -332,11 +335,10 @@ def _method_role(comparison: Comparison, row: MethodResult) -> str:
     return OTHER if row in comparison.beating else INITIAL
 
 
-def _ratios(
-    comparison: Comparison, rows: Sequence[MethodResult], names: list[str], methods: Axis
-) -> Panel:
+def _ratios(comparison: Comparison, rows: Sequence[MethodResult], methods: Axis) -> Panel:
     """Return standard deviations over the design's, or over the scales if the design has none."""
     wanted = list(comparison.wanted)
+    names = [comparison.parameters[j] for j in wanted]
     std = np.array([row.std[wanted] for row in rows]).reshape(len(rows), len(wanted))
     design = comparison.design
     reference, title = comparison.scale[wanted], "σ of each parameter / its scale"
