@@ -271,6 +271,8 @@ def read_arrays(path: Path, kind: str) -> dict[str, np.ndarray]:
         for name, value in arrays.items():
             if not isinstance(value, np.ndarray):
                 raise ValueError(f"{name} is no array")
+            # Records share arrays that nobody can change.
+            value.setflags(write=False)
         return arrays
     except DAMAGED_ARCHIVE as error:
         raise RecordingError(

@@ -91,7 +91,10 @@ def terms(_: str) -> str:
                 f"MuJoCo: {term.elements}.\n",
                 table(
                     ("field", "meaning", "unit at a hinge"),
-                    [(f"`{f.name}`", f.description, f.unit or "none") for f in term.fields],
+                    [
+                        (f"`{field}`", meaning, unit or "none")
+                        for field, meaning, unit in term.fields
+                    ],
                 ),
                 *(f"* {source}" for source in term.sources),
                 "",

@@ -49,7 +49,7 @@ def campaign(
             help="Continue a simulated campaign, with its settings, after its last complete round.",
         ),
     ] = False,
-) -> None:
+) -> int:
     """Repeat design, recording and estimate until every target accuracy is reached.
 
     Without --real, the robot is simulated at the `true` values. With --real, each call estimates
@@ -106,7 +106,7 @@ def campaign(
             "then repeat this call with --recordings FILE.csv"
         )
     say_written(run.output)
-    raise typer.Exit(0 if page.verdict.ok else 1)
+    return 0 if page.verdict.ok else 1
 
 
 @dataclass(kw_only=True)

@@ -1,4 +1,4 @@
-"""`mjfim check` and `mjfim rehearse`: what a motion tells, and whether it is safe."""
+"""`mjfim check`, `rehearse` and `worth`: what a motion tells, its safety, and what would help."""
 
 from __future__ import annotations
 
@@ -15,10 +15,11 @@ from mjfim.cli.common import (
     OtherDesign,
     Run,
     draw_elsewhere,
+    experiment_of,
     verb,
 )
 from mjfim.cli.progress import progress
-from mjfim.errors import MAX_ROBOTS
+from mjfim.errors import MAX_ROBOTS, ExperimentError
 
 
 @verb(needs_folder=False)
@@ -32,13 +33,13 @@ def check(
         ),
     ] = None,
     design_file: OtherDesign = None,
-) -> None:
+) -> int:
     """Say which parameters can be identified, how accurately, and which only in combination."""
     stated = mjfim.Experiment.from_file(experiment)
     if run.output:
         draw_elsewhere()
 
-    from mjfim.experiment.given import check_fits, recordings_of
+    from mjfim.experiment.given import recordings_of
     from mjfim.experiment.system import System
     from mjfim.output import archive
 
@@ -47,14 +48,13 @@ def check(
         loaded = recordings_of(system, recordings or [])
     trajectory = None
     if design_file is not None:
-        trajectory = archive.read_design(design_file)["final"]
-        check_fits(design_file, trajectory, system)
+        trajectory = archive.read_design(design_file, system)["final"]
     run.claim(mjfim.Check, stated, [*(recordings or []), design_file])
 
     with run.workers() as workers, progress("checking"):
         result = mjfim.check(stated, loaded, trajectory, threads=run.threads, executor=workers)
 
-    raise typer.Exit(run.finish(result, system, design=design_file and design_file.parent))
+    return run.finish(result, system, design=design_file and design_file.parent)
 
 
 @verb(without=("executor",), needs_folder=False)
@@ -83,21 +83,76 @@ def rehearse(
     seed: Annotated[
         int | None, typer.Option(min=0, help="Seed of the robots; overrides rehearsal.seed.")
     ] = None,
-) -> None:
+) -> int:
     """Play a design on simulated robots that differ from the model, and say whether it is safe."""
-    from mjfim.output.folders import find_experiment_file
-
-    stated = mjfim.Experiment.from_file(experiment or find_experiment_file(design_file))
-    changed = {"robots": robots, "wrong": wrong, "latency": latency, "seed": seed}
-    changed |= {"feedback": feedback or None}
-    stated = stated.replace(
+    changed = {
+        "robots": robots,
+        "wrong": wrong,
+        "latency": latency,
+        "feedback": feedback or None,
+        "seed": seed,
+    }
+    stated = experiment_of(design_file, experiment).replace(
         rehearsal={key: value for key, value in changed.items() if value is not None}
     )
 
     from mjfim.experiment.system import System
 
-    design = mjfim.Design.load(design_file)
     run.claim(mjfim.Rehearsal, stated, [design_file])
     with progress("playing the design"):
-        result = mjfim.rehearse(stated, design, threads=run.threads)
-    raise typer.Exit(run.finish(result, System.resolve(stated), design=design_file.parent))
+        result = mjfim.rehearse(stated, mjfim.Design.load(design_file), threads=run.threads)
+    return run.finish(result, System.resolve(stated), design=design_file.parent)
+
+
+@verb(without=("executor",), needs_folder=False)
+def worth(
+    source: Annotated[
+        Path,
+        typer.Argument(
+            metavar="DESIGN|EXPERIMENT",
+            help="Folder of `mjfim design`, its file design.npz, or an experiment file (TOML), "
+            "whose initial control is played then.",
+        ),
+    ],
+    run: Run,
+    experiment: ExperimentOfDesign = None,
+    add: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="SENSOR=SIGMA",
+            help="Sensor that the model lacks, and its noise [SI unit]: torque, acceleration (all "
+            "joints) or torque:JOINT; gyro:PLACE, accelerometer:PLACE, force:PLACE, moment:PLACE "
+            "at a site or body. Several times for several sensors.",
+        ),
+    ] = None,
+    seconds: Annotated[
+        float,
+        typer.Option(min=0.0, help="Time in which new designs check the prices of limits."),
+    ] = 60.0,
+) -> None:
+    """Say which sensor, which data and which limit would make the parameters more accurate."""
+    from mjfim.experiment.system import System
+
+    is_design = source.is_dir() or source.suffix == ".npz"
+    file = source / "design.npz" if source.is_dir() else source
+    stated = experiment_of(file, experiment if is_design else experiment or source)
+    design = mjfim.Design.load(file) if is_design else None
+    added = dict(map(_sensor, add or []))
+    if run.output:
+        draw_elsewhere()
+    run.claim(mjfim.Worth, stated, [file])
+    with progress("comparing"):
+        result = mjfim.worth(stated, design, add=added, seconds=seconds, threads=run.threads)
+    run.finish(result, System.resolve(stated), design=file.parent if is_design else None)
+
+
+def _sensor(text: str) -> tuple[str, float]:
+    """Read a sensor and its noise."""
+    name, _, sigma = text.partition("=")
+    try:
+        value = float(sigma)
+    except ValueError:
+        value = 0.0
+    if not value > 0.0:
+        raise ExperimentError(f"--add {text}: expected SENSOR=SIGMA, for example torque=0.1")
+    return name, value

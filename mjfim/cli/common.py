@@ -74,7 +74,9 @@ FILES = {
     "list": "inventory",
     "validate": "inventory",
     "rehearse": "check",
+    "worth": "check",
     "compare-robots": "compare",
+    "payload": "identify",
     "montecarlo": "simulate",
     "export": "results",
     "report": "results",
@@ -185,6 +187,8 @@ Force = Annotated[
         hidden=True,
     ),
 ]
+
+NoiseSeed = Annotated[int, typer.Option("--seed", min=0, help="Seed of the noise.")]
 
 VideoFile = Annotated[
     Path | None,
@@ -453,6 +457,13 @@ def draw_elsewhere() -> None:
         _claims.enter_context(drawing_elsewhere())
 
 
+def experiment_of(design_file: Path, stated: Path | None) -> mjfim.Experiment:
+    """The experiment that the user states for a design, or else the one of the design."""
+    from mjfim.output.folders import find_experiment_file
+
+    return mjfim.Experiment.from_file(stated or find_experiment_file(design_file))
+
+
 def keep_result(folder: Path | None = None) -> None:
     """Say that there is a result, so that Ctrl-C does not end the verb before it is written."""
     interruption = current_interruption()
@@ -534,7 +545,8 @@ def _first_command(folder: Path) -> str:
     return ""
 
 
-Verb = Callable[..., None]
+# A verb, which returns its exit code; None is 0.
+Verb = Callable[..., int | None]
 
 
 def verb(*, without: Collection[str] = (), needs_folder: bool = True) -> Callable[[Verb], Verb]:
@@ -555,35 +567,34 @@ def verb(*, without: Collection[str] = (), needs_folder: bool = True) -> Callabl
             shared = {name: each for name, each in options.items() if name not in without}
         if not needs_folder:
             shared["output"] = shared["output"].replace(default=None)
+        parameters = [
+            each.replace(kind=inspect.Parameter.KEYWORD_ONLY)
+            for each in (*own.values(), *shared.values())
+        ]
 
         @wraps(function)
         def wrapped(**arguments: Any) -> None:
             """Call the verb; print one message and exit for each error."""
             options = {name: arguments.pop(name) for name in shared}
+            _carry_out(function, arguments, options)
 
-            def call() -> None:
-                """Call the verb itself."""
-                _require_inputs(arguments)
-                function(**arguments, **({"run": Run(**options)} if shared else {}))
-
-            _carry_out(call)
-
-        parameters = [
-            each.replace(kind=inspect.Parameter.KEYWORD_ONLY)
-            for each in (*own.values(), *shared.values())
-        ]
         vars(wrapped)["__signature__"] = inspect.Signature(parameters)
-        name = function.__name__.rstrip("_").replace("_", "-")
-        hidden = [_names_of(each)[0] for each in parameters if _option(each).hidden]
-        app.command(
-            name,
-            cls=VerbCommand,
-            rich_help_panel=next(step for step, names in STEPS.items() if name in names),
-            epilog=f"Also {', '.join(hidden)}: see `mjfim --help`." if hidden else None,
-        )(wrapped)
+        _add_command(wrapped, parameters)
         return wrapped
 
     return register
+
+
+def _add_command(function: Verb, parameters: Iterable[inspect.Parameter]) -> None:
+    """Add a verb to the app. The help of `mjfim` shows it at its step of an experiment."""
+    name = function.__name__.rstrip("_").replace("_", "-")
+    hidden = [_names_of(each)[0] for each in parameters if _option(each).hidden]
+    app.command(
+        name,
+        cls=VerbCommand,
+        rich_help_panel=next(step for step, names in STEPS.items() if name in names),
+        epilog=f"Also {', '.join(hidden)}: see `mjfim --help`." if hidden else None,
+    )(function)
 
 
 def _require_inputs(arguments: Mapping[str, Any]) -> None:
@@ -596,19 +607,19 @@ def _require_inputs(arguments: Mapping[str, Any]) -> None:
                 raise RecordingError(f"{path}: no such file")
 
 
-def _carry_out(call: Callable[[], None]) -> None:
-    """Call a verb; print one message and exit for each error and for Ctrl-C."""
+def _carry_out(function: Verb, arguments: Mapping[str, Any], options: Mapping[str, Any]) -> None:
+    """Call a verb with those of a `Run`; print one message and exit for each error and Ctrl-C."""
     interruption = Interruption(say_from_program)
     code = 0
     try:
         with interruption, _claims, _worded_warnings():
-            call()
+            _require_inputs(arguments)
+            run = {"run": Run(**options)} if options else {}
+            code = function(**arguments, **run) or 0
     except (InterruptedByUserError, NoResultError, UnfinishedError):
         interruption.incomplete, code = True, INTERRUPTED_CODE
     except (MjfimError, MemoryError, OSError) as error:
         raise _told(error) from None
-    except typer.Exit as end:
-        code = end.exit_code
     except Exception as error:
         # MuJoCo has several kinds of errors for a lack of memory.
         if "allocate memory" not in str(error):

@@ -34,7 +34,7 @@ def compare(
         ),
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the baselines.")] = 0,
-) -> None:
+) -> int:
     """Compare the design with chirps, multisines, Fourier series and splines of equal budget.
 
     The exit code is 1 if one of them is better than the design.
@@ -64,7 +64,7 @@ def compare(
     if not result.rows:
         raise NoResultError
 
-    raise typer.Exit(run.finish(result, system))
+    return run.finish(result, system)
 
 
 # Files of an estimate.
@@ -87,7 +87,7 @@ def compare_robots(
         ),
     ],
     run: Run,
-) -> None:
+) -> int:
     """Say which parameters of two robots differ, or what changed in one robot since.
 
     The exit code is 1 if they differ, or if one of the estimates is not reliable.
@@ -104,7 +104,7 @@ def compare_robots(
         "first": relative_name(first, run.output),
         "second": relative_name(second, run.output),
     }
-    raise typer.Exit(run.finish(result, None, further=origin))
+    return run.finish(result, None, further=origin)
 
 
 def _names(first: Path, second: Path) -> tuple[str, str]:

@@ -45,7 +45,7 @@ def design(
     ] = False,
     video: VideoFile = None,
     live: LiveView = None,
-) -> None:
+) -> int:
     """Design the excitation that gives the most information about the parameters."""
     stated = mjfim.Experiment.from_file(experiment)
     draw_elsewhere()
@@ -81,7 +81,7 @@ def design(
                 )
             except OutOfReachError as error:
                 say_from_program(str(error))
-                raise typer.Exit(1) from None
+                return 1
             result = found.design
         else:
             result = mjfim.design(stated, callback=show, threads=run.threads, executor=workers)
@@ -103,7 +103,7 @@ def design(
         )
     code = run.finish(result, system, design=run.output, further=further, remarks=remarks)
     write_wanted_video(video, system, result)
-    raise typer.Exit(code or int(found is not None and not found.closed))
+    return code or int(found is not None and not found.closed)
 
 
 def _cores(task: DesignTask) -> int:

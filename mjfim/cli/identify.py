@@ -1,4 +1,4 @@
-"""`mjfim identify`: estimates of the parameters from recordings."""
+"""`mjfim identify` and `mjfim payload`: estimates of the parameters from recordings."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ def identify(
     seed: Annotated[int, typer.Option(min=0, help="Seed of the drawn robots.")] = 0,
     video: VideoFile = None,
     live: LiveView = None,
-) -> None:
+) -> int:
     """Estimate the parameters from recordings, with intervals, predictions and warnings."""
     stated = mjfim.Experiment.from_file(experiment)
     if select and method == "newton":
@@ -131,7 +131,7 @@ def identify(
     remarks = [f"warning: --samples: no robots were drawn{not_drawn}"] if not_drawn else []
     code = run.finish(result, system, sections=sections, remarks=remarks)
     write_wanted_video(video, system, result)
-    raise typer.Exit(code or int(bool(not_drawn)))
+    return code or int(bool(not_drawn))
 
 
 def _with_draws(result: Estimate, system: System, count: int, seed: int) -> tuple[Estimate, str]:
@@ -160,3 +160,87 @@ def _with_draws(result: Estimate, system: System, count: int, seed: int) -> tupl
             "this estimate"
         )
     return replace(result, draws=replace(found[0], seed=seed)), ""
+
+
+@verb(without=("executor",))
+def payload(
+    experiment: ExperimentFile,
+    recordings: Annotated[
+        list[Path],
+        typer.Argument(metavar="RECORDING", help="Logs of the robot with the payload."),
+    ],
+    run: Run,
+    body: Annotated[
+        str | None,
+        typer.Option(
+            "--body",
+            metavar="BODY",
+            help="Body that carries the payload; default: the one at which the experiment states "
+            "a term of the kind `payload`.",
+            show_default=False,
+        ),
+    ] = None,
+    robot: Annotated[
+        Path | None,
+        typer.Option(
+            "--from",
+            metavar="DIR",
+            help="Folder of `mjfim identify` of the robot without the payload; its uncertainty "
+            "becomes part of the payload's.",
+        ),
+    ] = None,
+    without: Annotated[
+        list[Path] | None,
+        typer.Option(
+            "--without",
+            metavar="FILE",
+            help="Log of the robot without the payload, from which its parameters are estimated "
+            "first; may be given several times.",
+        ),
+    ] = None,
+    size: Annotated[
+        float | None,
+        typer.Option(
+            "--size",
+            metavar="METRES",
+            help="Edge of a cube with the payload's volume in metres, for its rotational inertia "
+            "where the logs do not determine it. Default: a cube of water.",
+            show_default=False,
+        ),
+    ] = None,
+) -> int:
+    """Estimate mass and centre of mass of an unknown payload on a known robot.
+
+    It writes the files of `identify`, and `identified.xml` holds the payload. The exit code is 1 if
+    the recordings show no payload, or where `identify` would exit with 1.
+    """
+    stated = mjfim.Experiment.from_file(experiment)
+
+    from mjfim.experiment.packing import with_model
+    from mjfim.output.folders import identified_models
+    from mjfim.recordings.read import read_recording, recording_paths
+    from mjfim.studies.payload import PayloadTask
+
+    task = PayloadTask.of(
+        with_model(stated),
+        body=body,
+        robot=None if robot is None else mjfim.Estimate.load(robot),
+        size=size,
+        threads=run.threads,
+        source="the earlier estimate" if robot is None else f"the estimate in {robot}",
+    )
+    # All logs hold the same signals, whether the payload is there or not.
+    system = task.system()
+    paths = recording_paths(recordings, system.channels)
+    unloaded = recording_paths(without or [], system.channels)
+    models = identified_models(run.output, system.model_path)
+    run.claim(mjfim.Estimate, stated, [*recordings, *(without or []), robot], models)
+
+    with progress("reading"):
+        logs = [read_recording(path, system.channels) for path in (*paths, *unloaded)]
+    with progress("fitting the payload") as display:
+        result, loaded = task.identify(
+            logs[: len(paths)], without=logs[len(paths) :], callback=display
+        )
+
+    return run.finish(result, loaded)

@@ -17,8 +17,7 @@ from rich.progress import BarColumn, Progress, ProgressColumn, Task, TextColumn
 from rich.table import Column
 from rich.text import Text
 
-from mjfim.output.live import HERE, live_system
-from mjfim.output.progress_text import design_stage, progress_line
+from mjfim.output.live import HERE, design_stage, live_system, progress_line
 from mjfim.records.events import Callback, DesignEvent, Event, stages_observed_by
 
 if TYPE_CHECKING:

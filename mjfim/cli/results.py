@@ -16,6 +16,7 @@ from mjfim.cli.common import (
     Pictures,
     claim_file,
     claim_folder,
+    experiment_of,
     keep_result,
     verb,
 )
@@ -67,11 +68,10 @@ def export(
         write_export,
     )
     from mjfim.output.export.trajectories import RobotPlan
-    from mjfim.output.folders import find_experiment_file
 
     require_options(to, positions, storage, unit)
     file = design_folder / "design.npz" if design_folder.is_dir() else design_folder
-    stated = mjfim.Experiment.from_file(experiment or find_experiment_file(file))
+    stated = experiment_of(file, experiment)
     inputs = input_files(stated, [design_folder])
     if is_folder(to):
         claim_folder(output, exported_files(to, output), inputs, force=force)
@@ -137,34 +137,30 @@ def replay(
     force: Force = False,
 ) -> None:
     """Show a result in the Rerun viewer."""
-    from mjfim.experiment.given import check_fits
     from mjfim.experiment.system import System, labels_of_system
-    from mjfim.output import archive
-    from mjfim.output import rerun as rerun_log
-    from mjfim.output.folders import find_experiment_file, find_rerun_file
+    from mjfim.output import archive, rerun
+    from mjfim.output.folders import find_rerun_file
 
-    if save is not None and save.suffix != ".rrd":
-        raise RecordingError(f"--save {save}: a Rerun file ends in .rrd")
     target = save or Path(tempfile.mkdtemp(prefix="mjfim-")) / "replay.rrd"
     if save is not None:
+        if save.suffix != ".rrd":
+            raise RecordingError(f"--save {save}: a Rerun file ends in .rrd")
         inputs = sorted(source.iterdir()) if source.is_dir() else [source]
         claim_file(save, inputs, force=force)
     if source.suffix == ".npz":
-        stated = experiment or find_experiment_file(source)
-        system = System.resolve(mjfim.Experiment.from_file(stated))
-        named = archive.read_design(source)
-        for trajectory in named.values():
-            check_fits(source, trajectory, system)
-        rerun_log.log_trajectories(
+        system = System.resolve(experiment_of(source, experiment))
+        named = archive.read_design(source, system)
+        rerun.log_trajectories(
             target, system.model_at(system.theta), named, labels_of_system(system)
         )
     else:
         found = find_rerun_file(source)
-        if save is not None:
+        if save is None:
+            target = found
+        else:
             with replacing(save) as temporary:
                 shutil.copyfile(found, temporary)
-        target = save or found
     if save is None:
-        rerun_log.show(target)
+        rerun.show(target)
     else:
         say(f"wrote {target}")

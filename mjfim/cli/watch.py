@@ -56,7 +56,7 @@ def watch(
         ),
     ] = STDIN,
     live: LiveView = None,
-) -> None:
+) -> int:
     """Say while a robot records how accurately the rows so far determine the parameters."""
     stated = mjfim.Experiment.from_file(experiment)
     if stream != STDIN and not (Path(stream).exists() and not Path(stream).is_dir()):
@@ -78,7 +78,7 @@ def watch(
     interruption = current_interruption()
     if interruption is not None:
         interruption.presses = 0
-    raise typer.Exit(run.finish(result, meter.system))
+    return run.finish(result, meter.system)
 
 
 def _followed(

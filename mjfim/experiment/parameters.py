@@ -50,7 +50,7 @@ LOGCHOLESKY_FIELDS = tuple(f"logcholesky[{i}]" for i in range(10))
 
 
 def resolve_parameters(
-    experiment: Experiment, source: ModelSource, mocap: MocapPlacement | None, outputs: Outputs
+    experiment: Experiment, source: ModelSource, mocap: MocapPlacement, outputs: Outputs
 ) -> ParameterSet:
     """Resolve all parameters in the order of theta.
 
@@ -59,7 +59,7 @@ def resolve_parameters(
     Args:
         experiment: The experiment.
         source: Its model.
-        mocap: Where mocap bodies start; None where they start as compiled.
+        mocap: Where mocap bodies start.
         outputs: The measured outputs.
 
     Returns:

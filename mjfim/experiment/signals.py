@@ -239,7 +239,7 @@ def resolve_controllers(
     laws: list[ControlLaw] = []
     for control, actuator in enumerate(source.coordinates.controls):
         if actuator not in stated:
-            inputs.append(InputColumn(name=f"ctrl:{actuator}", control=control))
+            inputs.append((f"ctrl:{actuator}", "", control))
             continue
 
         spec, joint = stated[actuator], joints[actuator]
@@ -337,7 +337,7 @@ def _columns(
     }
     for quantity, (is_read, unit) in wanted.items():
         if is_read:
-            yield quantity, InputColumn(name=f"{quantity}:{actuator}", unit=unit)
+            yield quantity, (f"{quantity}:{actuator}", unit, None)
 
 
 def _tick(experiment: Experiment, actuator: str, spec: ControllerSpec, timestep: float) -> int:

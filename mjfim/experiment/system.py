@@ -68,7 +68,7 @@ class System:
         outputs: The ny measured outputs.
         stated_noise: Noise of the outputs on the stated grid.
         nominal_initial_state: (ns,) nominal initial state.
-        mocap: Poses of the mocap bodies in the initial keyframe; None: those of the model.
+        mocap: Poses of the mocap bodies in the initial keyframe.
         variant: How the plant differs from the user's model.
         plant: The plant, which simulates the system at any theta.
     """
@@ -81,7 +81,7 @@ class System:
     outputs: Outputs
     stated_noise: Noise
     nominal_initial_state: Array
-    mocap: MocapPlacement | None
+    mocap: MocapPlacement
     variant: ModelVariant
     plant: Plant
 
@@ -434,7 +434,7 @@ class System:
             A new MjModel, which the caller may change.
         """
         model = ParameterWriter(self.parameters).model(self._whole_model, theta)
-        if self.mocap is not None and not at_keyframe:
+        if not at_keyframe:
             self.mocap.put(model, self.mocap.compiled)
         return model
 

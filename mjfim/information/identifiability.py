@@ -26,13 +26,13 @@ from mjfim.information.null_space import (
 from mjfim.model.parameters import ParameterSet
 from mjfim.plant.outputs import Noise
 from mjfim.plant.plant import SENSITIVITY_STEP, Plant
+from mjfim.records.base import ParameterValue, listed_values
 from mjfim.records.check import (
     ParameterGroup,
     combination_matrix,
     combination_terms,
     groups_in_words,
 )
-from mjfim.records.design import CombinationAccuracy
 from mjfim.records.trajectory import Sensitivity, Trajectory
 
 # Number of random trajectories that are tried.
@@ -80,7 +80,7 @@ class Identifiability:
 
     def combinations(
         self, information: FisherInformation, values: Array, before: Array, after: Array
-    ) -> tuple[CombinationAccuracy, ...]:
+    ) -> tuple[ParameterValue, ...]:
         """Identifiable combinations with their standard deviations for two information matrices.
 
         Args:
@@ -90,7 +90,8 @@ class Identifiability:
             after: (p, p) information of the second experiment.
 
         Returns:
-            Accuracies of the combinations; empty if every parameter is identifiable.
+            The combinations with σ by the second matrix, and σ by the first one as `std_initial`;
+            empty if every parameter is identifiable.
         """
         rows = combination_matrix(self.groups_along_all, self.names)
         words = [
@@ -98,16 +99,9 @@ class Identifiability:
             for group in self.groups_along_all
             for combination in group.combinations
         ]
-        initial, final = (
-            information.combination_std(matrix, rows).tolist() for matrix in (before, after)
-        )
-
-        return tuple(
-            CombinationAccuracy(expression=text, value=value, std_initial=first, std_final=last)
-            for text, value, first, last in zip(
-                words, (rows @ values).tolist(), initial, final, strict=True
-            )
-        )
+        first, second = (information.combination_std(matrix, rows) for matrix in (before, after))
+        units = [""] * len(words)
+        return tuple(listed_values(words, units, rows @ values, second, std_initial=first))
 
 
 # Rows of G along a motion, and their change with a longer difference step.

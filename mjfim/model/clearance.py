@@ -22,7 +22,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from mjfim.arrays import Array, record
+from mjfim.arrays import Array
 from mjfim.errors import ExperimentError, SimulationDivergedError, unknown
 from mjfim.model.elements import geom_labels, model_length, unique_names
 from mjfim.model.loading import ModelSource
@@ -122,21 +122,9 @@ def with_floor(source: ModelSource, height: float) -> ModelSource:
     return source.with_elements((FLOOR, height), lambda spec: spec.worldbody.add_geom(**plane))
 
 
-@record
-class GeomPair:
-    """Two geoms that can come near each other.
-
-    Attributes:
-        first: Number of a geom that can move.
-        second: Number of the other geom; a geom that cannot move is always the second one.
-        name: Name of the pair, `<geom> - <geom>`.
-        bodies: Name of the pair of their bodies, `<body> - <body>`.
-    """
-
-    first: int
-    second: int
-    name: str
-    bodies: str
+# Two geoms that can come near each other: number of a geom that can move, number of the other geom
+# (a geom that cannot move is always the second one), and name of the pair, `<geom> - <geom>`.
+GeomPair = tuple[int, int, str]
 
 
 def _require_pairs(ignored: Collection[frozenset[str]], bodies: Sequence[str]) -> None:
@@ -183,14 +171,7 @@ def find_geom_pairs(model: Any, ignored: Collection[frozenset[str]]) -> tuple[Ge
                     f"distance; ignore the bodies {pair[0]!r} and {pair[1]!r}, or use boxes or "
                     "meshes"
                 )
-        found.append(
-            GeomPair(
-                first=first,
-                second=second,
-                name=f"{labels[first]} - {labels[second]}",
-                bodies=" - ".join(pair),
-            )
-        )
+        found.append((first, second, f"{labels[first]} - {labels[second]}"))
     return tuple(found)
 
 
@@ -281,10 +262,10 @@ class GeomDistances:
         self._max_bounds = max_bounds
 
         # Pairs of one column are adjacent, columns in the order in which they first appear.
-        body = model.geom_bodyid
+        body = model.geom_bodyid.tolist()
         keys = [
-            (int(body[p.first]), int(body[p.second])) if grouped else (p.first, p.second)
-            for p in chosen
+            (body[first], body[second]) if grouped else (first, second)
+            for first, second, _ in chosen
         ]
         number = {key: i for i, key in enumerate(dict.fromkeys(keys))}
         order = sorted(range(len(chosen)), key=lambda i: number[keys[i]])
@@ -293,7 +274,11 @@ class GeomDistances:
         self._first_of_column = np.searchsorted(self._column, np.arange(len(number)))
 
         leaders = [self.pairs[i] for i in self._first_of_column]
-        self.columns = tuple(p.bodies if grouped else p.name for p in leaders)
+        bodies = unique_names(model, "body")
+        self.columns = tuple(
+            f"{bodies[body[first]]} - {bodies[body[second]]}" if grouped else name
+            for first, second, name in leaders
+        )
 
         # (m, nv): +1 where a degree of freedom moves the second body only, -1 where the first only,
         # else 0.
@@ -302,9 +287,9 @@ class GeomDistances:
             dof, count = model.body_dofadr[each], model.body_dofnum[each]
             moved[each] = moved[model.body_parentid[each]]
             moved[each, dof : dof + count] = 1.0
-        first_bodies = body[[p.first for p in leaders]]
-        second_bodies = body[[p.second for p in leaders]]
-        self._dof_sign = moved[second_bodies] - moved[first_bodies]
+        self._dof_sign = np.array(
+            [moved[body[second]] - moved[body[first]] for first, second, _ in leaders]
+        )
 
         self._length = model_length(model)
         self._infinite = INFINITE_DISTANCE * self._length
@@ -325,8 +310,8 @@ class GeomDistances:
     def _prepare_pairs(self) -> None:
         """Set what the distance of each pair needs."""
         model = self._model
-        self._first = np.array([pair.first for pair in self.pairs])
-        self._second = np.array([pair.second for pair in self.pairs])
+        self._first = np.array([first for first, _, _ in self.pairs])
+        self._second = np.array([second for _, second, _ in self.pairs])
         # (2, p) types of the geoms.
         kinds = model.geom_type[np.stack([self._first, self._second])]
         # Numbers of the pairs whose second geom is a plane, and (p,) True for a primitive over a
@@ -346,8 +331,10 @@ class GeomDistances:
         axis_model.geom_size[capsules, 0] = AXIS_RADIUS * self._length
         # Arguments of MuJoCo's function, pair by pair.
         self._calls = [
-            (axis_model if axis else model, pair.first, pair.second, float(offset))
-            for pair, axis, offset in zip(self.pairs, by_axis, self._axis_offset, strict=True)
+            (axis_model if axis else model, first, second, float(offset))
+            for (first, second, _), axis, offset in zip(
+                self.pairs, by_axis, self._axis_offset, strict=True
+            )
         ]
 
     def __call__(self, qpos: Array, slopes: bool) -> SignedDistances:
@@ -365,14 +352,14 @@ class GeomDistances:
         found = [slope for _, slope in blocks if slope is not None]
         return d, np.concatenate(found) if slopes else None
 
-    def nearest(self, qpos: Array) -> tuple[float, int, GeomPair]:
+    def nearest(self, qpos: Array) -> tuple[float, int, str]:
         """The smallest distance at any configuration, however large it is.
 
         Args:
             qpos: (n, nq) configurations, n > 0, finite.
 
         Returns:
-            The distance [m], the row of its configuration, and its pair.
+            The distance [m], the row of its configuration, and the name of its pair.
 
         Raises:
             SimulationDivergedError: A configuration is not finite.
@@ -385,21 +372,21 @@ class GeomDistances:
 
         positions, frames, _ = self._poses(qpos, False)
         bounds, _ = self._lower_bounds(positions, frames)
-        best, row, pair = np.inf, 0, self.pairs[0]
+        best, row, pair = np.inf, 0, 0
 
         # Measure in ascending order of the bounds. Stop at the first bound that exceeds the
         # smallest distance found: no later pair can be nearer.
         for place in np.argsort(bounds, axis=None).tolist():
             k, p = divmod(place, len(self.pairs))
-            distance = float(bounds[k, p])
+            distance = bounds[k, p]
             if distance >= best:
                 break
             if not self._exact[p]:
                 self._set_pose(positions[k], frames[k])
                 distance = self._distance(p, min(best, self._infinite), None)
             if distance < best:
-                best, row, pair = distance, k, self.pairs[p]
-        return best, row, pair
+                best, row, pair = distance, k, p
+        return best, row, self.pairs[pair][2]
 
     def _block(self, qpos: Array, slopes: bool) -> SignedDistances:
         """Distances at configurations: (n, nq) whose bounds fit into memory. See `__call__`."""

@@ -62,19 +62,10 @@ Quantity = Literal["reference", "reference_velocity", "feedforward", "gain", "en
 CONTINUOUS: tuple[Quantity, ...] = ("reference", "reference_velocity", "feedforward")
 
 
-@record
-class InputColumn:
-    """One column of a log that drives a simulation.
-
-    Attributes:
-        name: Name of the column, such as `ctrl:<actuator>` or `reference:<actuator>`.
-        unit: Its unit; empty where it is not evident or there is none.
-        control: Address in ctrl that it sets; None for a column that a law reads.
-    """
-
-    name: str
-    unit: str = ""
-    control: int | None = None
+# One column of a log that drives a simulation: its name, such as `ctrl:<actuator>` or
+# `reference:<actuator>`, its unit, which is empty where it is not evident, and the address in ctrl
+# that it sets, None for a column that a law reads.
+InputColumn = tuple[str, str, int | None]
 
 
 @record
@@ -145,12 +136,12 @@ class ControlLaws:
     @property
     def columns(self) -> tuple[str, ...]:
         """Names of the input columns."""
-        return tuple(column.name for column in self.inputs)
+        return tuple(name for name, _, _ in self.inputs)
 
     @cached_property
     def direct(self) -> tuple[np.ndarray, np.ndarray]:
         """Indices of the inputs that are controls themselves, and their addresses in ctrl."""
-        pairs = [(i, c.control) for i, c in enumerate(self.inputs) if c.control is not None]
+        pairs = [(i, place) for i, (_, _, place) in enumerate(self.inputs) if place is not None]
         both = np.array(pairs, dtype=np.intp).reshape(-1, 2)
         return both[:, 0], both[:, 1]
 

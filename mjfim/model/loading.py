@@ -93,10 +93,10 @@ def resolve_packages(
         else:
             mesh.file = found.as_posix()
     names = {name for each in absent.values() for name in each}
-    for geom in [geom for geom in spec.geoms if geom.meshname in names]:
-        spec.delete(geom)
-    for mesh in [mesh for mesh in spec.meshes if mesh.name in names]:
-        spec.delete(mesh)
+    left_out = [geom for geom in spec.geoms if geom.meshname in names]
+    left_out += [mesh for mesh in spec.meshes if mesh.name in names]
+    for element in left_out:
+        spec.delete(element)
     for package, meshes in absent.items():
         message = (
             f"meshes of the package {package!r} are not found and left out ({len(meshes)}); masses "

@@ -13,14 +13,12 @@ from typing import Any
 
 import mujoco
 import numpy as np
-import scipy
 
 from mjfim.arrays import Array
 from mjfim.errors import ExperimentError, listed
 from mjfim.model.elements import element_name
 from mjfim.model.inertia import INERTIA_PARAMETRISATIONS
-from mjfim.model.loading import silence_mujoco_log
-from mjfim.model.parameters import ParameterSet, Target
+from mjfim.model.parameters import ParameterSet
 from mjfim.model.targets import InertiaField, ModelField, RotationField, SpecField, TermField
 from mjfim.model.variants import PlantModel
 
@@ -71,21 +69,14 @@ class ParameterWriter:
         MuJoCo's derived constants are computed anew. Values that need a compile are not written
         here, but by `model`.
         """
-        mocap = self.parameters.mocap
-
-        # MuJoCo derives constants from the compiled poses of mocap bodies.
-        if mocap is not None:
-            mocap.put(model, mocap.compiled)
-
         same_frame = mujoco.mjtSameFrame.mjSAMEFRAME_NONE
         for (kind, row), values in self._write_numbers(model, theta).items():
             if kind not in INERTIA_PARAMETRISATIONS:
                 # A body or site is turned from its nominal orientation. MuJoCo skips the
                 # orientation of sites whose frame coincides with their body's.
-                turns = scipy.spatial.transform.Rotation
-                nominal = turns.from_quat(self.parameters.nominal[kind, row], scalar_first=True)
-                turned = nominal * turns.from_rotvec(values)
-                getattr(model, kind)[row] = turned.as_quat(scalar_first=True)
+                quaternion = self.parameters.nominal[kind, row].copy()
+                mujoco.mju_quatIntegrate(quaternion, values, 1.0)
+                getattr(model, kind)[row] = quaternion
                 if kind == "site_quat":
                     model.site_sameframe[row] = same_frame
                 continue
@@ -102,11 +93,7 @@ class ParameterWriter:
         workspace = self.parameters.workspace
         if not workspace:
             workspace.append(mujoco.MjData(model))
-        with silence_mujoco_log():
-            mujoco.mj_setConst(model, workspace[0])
-
-        if mocap is not None:
-            mocap.put(model, mocap.start)
+        self.parameters.mocap.derive_constants(model, workspace[0])
 
     def unphysical_bodies(
         self, base: PlantModel | Any, theta: Array, rounding: float = MOMENT_ROUNDING
@@ -128,15 +115,14 @@ class ParameterWriter:
         """
         columns_of_body: dict[int, list[int]] = {}
         of_moments = set[int]()
-        for j, parameter in enumerate(self.parameters.parameters):
-            for target in parameter.targets:
-                field = target.field
-                if isinstance(field, InertiaField):
-                    columns_of_body.setdefault(field.body, []).append(j)
-                elif isinstance(field, ModelField) and field.array in ("body_mass", "body_inertia"):
-                    columns_of_body.setdefault(field.rows[0], []).append(j)
-                    if field.array == "body_inertia":
-                        of_moments.add(field.rows[0])
+        for j, target in self.parameters.targets():
+            field = target.field
+            if isinstance(field, InertiaField):
+                columns_of_body.setdefault(field.body, []).append(j)
+            elif isinstance(field, ModelField) and field.array in ("body_mass", "body_inertia"):
+                columns_of_body.setdefault(field.rows[0], []).append(j)
+                if field.array == "body_inertia":
+                    of_moments.add(field.rows[0])
 
         model = copy.copy(self.base(base, theta))
         parametrised = {
@@ -148,8 +134,8 @@ class ParameterWriter:
         found = []
         for body, columns in columns_of_body.items():
             # Moments that are no parameters are those of a model that MuJoCo has compiled.
-            kind, values = parametrised.get(body, ("", None))
-            allowed = rounding if kind or body in of_moments else np.inf
+            kind, values = parametrised.get(body, ("", np.zeros(0)))
+            allowed = rounding if kind or body in of_moments else 1.0
             fault = _inertia_fault(model, body, kind, values, allowed)
             if fault:
                 name = element_name(model, "body", body)
@@ -181,20 +167,18 @@ class ParameterWriter:
         whole: dict[tuple[str, int], Array] = {}
         terms = {term.name: term.values for term in p.whole_terms}
 
-        for parameter, value in zip(p.parameters, theta, strict=True):
-            for target in parameter.targets:
-                field = target.field
-                number = target.scale * float(value) + target.offset
-                if isinstance(field, ModelField):
-                    field.write(model, number)
-                elif isinstance(field, InertiaField):
-                    key = (field.parametrisation, field.body)
-                    whole.setdefault(key, np.array(p.nominal[key]))[field.component] = number
-                elif isinstance(field, RotationField):
-                    key = (field.array, field.row)
-                    whole.setdefault(key, np.zeros(3))[field.component] = number
-                elif isinstance(field, TermField):
-                    terms[field.term.name][field.field] = number
+        for j, target in p.targets():
+            field = target.field
+            number = target.scale * float(theta[j]) + target.offset
+            if isinstance(field, ModelField):
+                field.write(model, number)
+            elif isinstance(field, InertiaField | RotationField):
+                # A rotation is counted from the nominal orientation.
+                is_turn = isinstance(field, RotationField)
+                start = np.zeros(3) if is_turn else p.nominal[field.whole].copy()
+                whole.setdefault(field.whole, start)[field.component] = number
+            elif isinstance(field, TermField):
+                terms[field.term.name][field.field] = number
 
         # A term may also depend on numbers that parameters have set just now.
         for term in p.whole_terms:
@@ -217,10 +201,10 @@ class ParameterWriter:
             for target in parameter.targets:
                 if isinstance(target.field, SpecField):
                     number = target.scale * float(theta[j]) + target.offset
-                    _write_geom(spec, source.model, target, number)
+                    _write_geom(spec, source.model, target.field, target.path, number)
 
 
-def _inertia_fault(model: Any, body: int, kind: str, values: Array | None, rounding: float) -> str:
+def _inertia_fault(model: Any, body: int, kind: str, values: Array, rounding: float) -> str:
     """Reason why this inertia is unphysical, in words; empty where it is physical.
 
     A body that is welded to bodies with mass may be massless.
@@ -229,34 +213,29 @@ def _inertia_fault(model: Any, body: int, kind: str, values: Array | None, round
         model: The model with the numbers of theta.
         body: Number of the body.
         kind: Parametrisation of its inertia; empty where the model holds all of it.
-        values: (10,) coordinates in the parametrisation; None where the model holds all of them.
+        values: (10,) coordinates in the parametrisation; nothing where the model holds all of them.
         rounding: As in `unphysical_bodies`.
     """
     if kind == "logcholesky":
         return ""
 
-    mass = float(model.body_mass[body])
-    moments = np.sort(model.body_inertia[body])
-
     welded = model.body_weldid == model.body_weldid[body]
     welded[body] = False
     may_be_massless = model.body_weldid[body] == 0 or model.body_mass[welded].any()
-    least = 0.0 if may_be_massless else mujoco.mjMINVAL
+    least = 0.0 if may_be_massless and kind != "barycentric" else mujoco.mjMINVAL
 
-    if values is not None and kind == "barycentric":
-        mass = float(values[0])
-        least = mujoco.mjMINVAL
+    mass = values[0] if kind == "barycentric" else model.body_mass[body]
     if not mass >= least:
         return f"mass {mass:g} kg; it must be > 0"
 
-    if values is not None:
+    moments = np.sort(model.body_inertia[body])
+    if kind:
         moments = np.linalg.eigvalsh(INERTIA_PARAMETRISATIONS[kind].inertia(values).inertia)
-    excess = moments[2] - moments[0] - moments[1]
-    if not moments[0] >= least:
-        wanted = "all must be > 0"
-    elif not moments[2] or excess / moments[2] <= rounding:
-        return ""
-    else:
+    small, middle, large = moments
+    wanted = "all must be > 0"
+    if small >= least:
+        if large - small - middle <= rounding * large:
+            return ""
         wanted = (
             "the sum of the smaller two must be at least the largest (its pseudo-inertia is not "
             "positive semidefinite)"
@@ -265,43 +244,39 @@ def _inertia_fault(model: Any, body: int, kind: str, values: Array | None, round
     return f"principal moments of inertia {listed} kg m²; {wanted}"
 
 
-def _write_geom(spec: Any, compiled: Any, target: Target, value: float) -> None:
+def _write_geom(spec: Any, compiled: Any, field: SpecField, path: str, value: float) -> None:
     """Write a number of a geom into an MjSpec, in place.
 
     Args:
         spec: The spec (`mujoco.MjSpec`), a private copy of the caller.
         compiled: The model of this spec.
-        target: The number.
+        field: The number.
+        path: Its path, for the message.
         value: Its value.
 
     Raises:
         ExperimentError: The geom cannot be moved in the spec.
     """
-    field = target.field
-    assert isinstance(field, SpecField)
     geom, found = spec.geom(field.name), compiled.geom(field.name)
-    if field.field == "pos" and geom.frame is not None:
-        if geom.meshname:
-            raise ExperimentError(
-                f"{target.path!r}: a mesh inside a <frame> cannot be moved; take the geom out of "
-                "the frame"
-            )
-        # The pose is stated in the coordinates of the body instead of those of the `<frame>`.
-        geom.set_frame(geom.parent.add_frame())
-        geom.pos, geom.quat = found.pos, found.quat
-        geom.alt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
+    is_place = field.field == "pos"
+    is_in_frame = is_place and geom.frame is not None
+    if is_in_frame and geom.meshname:
+        raise ExperimentError(
+            f"{path!r}: a mesh inside a <frame> cannot be moved; take the geom out of the frame"
+        )
 
-    if np.isfinite(geom.fromto[0]):
-        # Its end points are replaced by the place and size that they compile to.
+    if is_in_frame or np.isfinite(geom.fromto[0]):
+        # The pose is stated in the coordinates of the body instead of those of a `<frame>`, and
+        # place and size as end points compile to them.
+        geom.set_frame(geom.parent.add_frame())
+        geom.alt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
         geom.fromto = np.full(6, np.nan)
         geom.pos, geom.quat, geom.size = found.pos, found.quat, found.size
 
-    if field.field in ("mass", "density"):
-        setattr(geom, field.field, value)
-        return
-    # The compiler adds the offset of a mesh to the position.
     numbers = np.array(getattr(geom, field.field))
-    if field.field == "pos" and geom.meshname:
+    # The compiler adds the offset of a mesh to the position.
+    if is_place and geom.meshname:
         value += float(numbers[field.index] - found.pos[field.index])
-    numbers[field.index] = value
+    # Mass and density are single numbers.
+    numbers.flat[field.index] = value
     setattr(geom, field.field, numbers)

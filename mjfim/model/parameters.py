@@ -33,7 +33,7 @@ from mjfim.model.targets import (
     TermField,
 )
 from mjfim.model.terms.term import Term, TermQuantity
-from mjfim.model.variants import MocapPlacement
+from mjfim.model.variants import AS_COMPILED, MocapPlacement
 
 # Fields of a body that change its inertial frame, so that the body must not be compiled as
 # "simple". Mass and principal inertias are not among them: a body stays simple whatever they are,
@@ -46,6 +46,9 @@ ARRAYS_BESIDE_INERTIA = {
     "barycentric": {"body_mass"},
     "logcholesky": set[str](),
 }
+
+# Arrays of MjModel that hold the inertia of a body.
+INERTIAL_ARRAYS = ("body_mass", "body_ipos", "body_inertia")
 
 # A function that edits an MjSpec in place at the value of one parameter.
 SpecEdit = Callable[[Any, float], None]
@@ -143,13 +146,23 @@ class Parameter:
     cad_prior: float | None = None
 
 
+def targets_of(parameters: Iterable[Parameter]) -> Iterator[tuple[Parameter, Target]]:
+    """Every target with its parameter."""
+    for parameter in parameters:
+        for target in parameter.targets:
+            yield parameter, target
+
+
 def moved_bodies(parameters: Sequence[Parameter]) -> frozenset[str]:
     """Names of bodies whose inertial frame a parameter may move.
 
     These bodies must not be compiled as "simple".
     """
-    targets = [target for parameter in parameters for target in parameter.targets]
-    paths = [ParameterPath.parse(text) for target in targets for text in target.plain_paths]
+    paths = [
+        ParameterPath.parse(text)
+        for _, target in targets_of(parameters)
+        for text in target.plain_paths
+    ]
     return frozenset(
         path.name
         for path in paths
@@ -165,7 +178,7 @@ class ParameterSet:
         parameters: The parameters.
         nominal: Values in the model of quantities that are written as a whole: (10,) coordinates of
             an inertia by (parametrisation, body), (4,) quaternions by (array, row).
-        mocap: Where mocap bodies start; None where they start as compiled.
+        mocap: Where mocap bodies start.
         whole_terms: Physical terms of the model that are written as a whole.
         earlier_rows: (l, p) rows R of what an earlier estimate knows: `|R (theta - guess)|^2` are
             squared standard deviations; None where there is no such knowledge.
@@ -173,7 +186,7 @@ class ParameterSet:
 
     parameters: tuple[Parameter, ...]
     nominal: dict[tuple[str, int], Array] = field(default_factory=dict)
-    mocap: MocapPlacement | None = None
+    mocap: MocapPlacement = AS_COMPILED
     whole_terms: tuple[Term, ...] = ()
     earlier_rows: Array | None = None
 
@@ -181,7 +194,7 @@ class ParameterSet:
     def build(
         parameters: Sequence[Parameter],
         model: Any,
-        mocap: MocapPlacement | None = None,
+        mocap: MocapPlacement = AS_COMPILED,
         terms: Iterable[Term] = (),
     ) -> ParameterSet:
         """Check that parameters can be varied together, and read their nominal values.
@@ -189,7 +202,7 @@ class ParameterSet:
         Args:
             parameters: The parameters, in the order of theta.
             model: The compiled model (`mujoco.MjModel`).
-            mocap: Where mocap bodies start; None where they start as compiled.
+            mocap: Where mocap bodies start.
             terms: Physical terms by which the model is extended.
 
         Raises:
@@ -317,7 +330,7 @@ class ParameterSet:
     def _derivative(self, kind: type[OutsideField], rows: int) -> Array:
         """(rows, p) derivative of what fields outside the model stand for."""
         matrix = np.zeros((rows, len(self)))
-        for j, target in self._targets():
+        for j, target in self.targets():
             if isinstance(target.field, kind):
                 matrix[target.field.row, j] += target.scale
         return matrix
@@ -366,7 +379,7 @@ class ParameterSet:
     @property
     def changes_friction(self) -> bool:
         """True where a parameter may change dry friction, even one that is nominally zero."""
-        paths = [target.path for _, target in self._targets()]
+        paths = [target.path for _, target in self.targets()]
         return bool(self._is_function.any()) or any("frictionloss" in path for path in paths)
 
     @property
@@ -381,11 +394,11 @@ class ParameterSet:
     def _has_field(self, kinds: type | tuple[type, ...]) -> np.ndarray:
         """(p,) True where a parameter has a field of one of these kinds."""
         found = np.zeros(len(self), dtype=bool)
-        for j, target in self._targets():
+        for j, target in self.targets():
             found[j] |= isinstance(target.field, kinds)
         return found
 
-    def _targets(self) -> Iterator[tuple[int, Target]]:
+    def targets(self) -> Iterator[tuple[int, Target]]:
         """Every target with the index of its parameter."""
         for j, parameter in enumerate(self.parameters):
             for target in parameter.targets:
@@ -406,29 +419,18 @@ def _in_one_parametrisation(parameters: Sequence[Parameter]) -> tuple[Parameter,
         ExperimentError: Parametrisations of one body are mixed.
     """
     # Parametrisations, and inertial arrays of MjModel, that are varied for each body.
-    parametrisations: dict[int, set[str]] = {}
-    arrays: dict[int, set[str]] = {}
-    inertial_arrays = ("body_mass", "body_ipos", "body_inertia")
+    varied: dict[int, set[str]] = {}
+    for _, target in targets_of(parameters):
+        body, coordinates = _inertia_of(target.field)
+        varied.setdefault(body, set()).add(coordinates)
 
-    for parameter in parameters:
-        for target in parameter.targets:
-            place = target.field
-            if isinstance(place, InertiaField):
-                parametrisations.setdefault(place.body, set()).add(place.parametrisation)
-            elif isinstance(place, ModelField) and place.array in inertial_arrays:
-                arrays.setdefault(place.rows[0], set()).add(place.array)
-
-    for parameter in parameters:
-        for target in parameter.targets:
-            body = _body_of(target.field)
-            if body in parametrisations:
-                _require_compatible(parameter, parametrisations[body], arrays.get(body, set()))
+    for parameter, target in targets_of(parameters):
+        _require_compatible(parameter, varied[_inertia_of(target.field)[0]])
 
     def converted(target: Target) -> Target:
         """The target; its field is the barycentric mass where first moments are varied."""
-        body = _body_of(target.field)
-        is_mass = isinstance(target.field, ModelField) and target.field.array == "body_mass"
-        if is_mass and parametrisations.get(body) == {"barycentric"}:
+        body, coordinates = _inertia_of(target.field)
+        if coordinates == "body_mass" and "barycentric" in varied[body]:
             return replace(target, field=InertiaField(body, "barycentric", 0))
         return target
 
@@ -438,28 +440,28 @@ def _in_one_parametrisation(parameters: Sequence[Parameter]) -> tuple[Parameter,
     )
 
 
-def _body_of(target_field: TargetField) -> int:
-    """Number of the body that a field belongs to; -1 where it is not one of a body."""
+def _inertia_of(target_field: TargetField) -> tuple[int, str]:
+    """The body whose inertia a field varies, and its parametrisation or array; -1 for none."""
     if isinstance(target_field, InertiaField):
-        return target_field.body
-    if isinstance(target_field, ModelField) and target_field.array.startswith("body_"):
-        return target_field.rows[0]
-    return -1
+        return target_field.body, target_field.parametrisation
+    if isinstance(target_field, ModelField) and target_field.array in INERTIAL_ARRAYS:
+        return target_field.rows[0], target_field.array
+    return -1, ""
 
 
-def _require_compatible(parameter: Parameter, parametrisations: set[str], arrays: set[str]) -> None:
+def _require_compatible(parameter: Parameter, varied: set[str]) -> None:
     """Raise unless the parameters of one body's inertia can be varied together.
 
     Args:
         parameter: Parameter of the body, for the message.
-        parametrisations: Parametrisations in which the inertia is varied; at least one.
-        arrays: Inertial arrays of MjModel that are varied as well.
+        varied: Parametrisations and arrays of MjModel in which its inertia is varied.
     """
-    first = next(iter(parametrisations))
-    if len(parametrisations) == 1 and arrays <= ARRAYS_BESIDE_INERTIA[first]:
+    parametrisations = varied & INERTIA_PARAMETRISATIONS.keys()
+    fits = [varied <= {each, *ARRAYS_BESIDE_INERTIA[each]} for each in parametrisations]
+    if not fits or any(fits):
         return
 
-    mixed = sorted({*parametrisations, *(array.removeprefix("body_") for array in arrays)})
+    mixed = sorted(name.removeprefix("body_") for name in varied)
     raise _parameter_error(
         parameter,
         f"the inertia of one body is varied in several coordinates at once ({', '.join(mixed)}); "
@@ -471,62 +473,54 @@ def _require_compatible(parameter: Parameter, parametrisations: set[str], arrays
 def _require_one_owner(parameters: Sequence[Parameter]) -> None:
     """Raise where two targets write one number."""
     owners: dict[object, str] = {}
-    for parameter in parameters:
-        for target in parameter.targets:
-            # A field that is written as a whole counts as one number.
-            numbers = getattr(target.field, "numbers", {target.field})
-            other = next((owners[number] for number in numbers if number in owners), None)
-            if other is not None:
-                raise _parameter_error(
-                    parameter,
-                    f"target {target.path!r} already belongs to parameters.{other}; two "
-                    "parameters cannot set one number",
-                )
+    for parameter, target in targets_of(parameters):
+        # A field that is written as a whole counts as one number.
+        numbers = getattr(target.field, "numbers", {target.field})
+        other = next((owners[number] for number in numbers if number in owners), None)
+        if other is not None:
+            raise _parameter_error(
+                parameter,
+                f"target {target.path!r} already belongs to parameters.{other}; two parameters "
+                "cannot set one number",
+            )
 
-            owners |= dict.fromkeys(numbers, parameter.name)
+        owners |= dict.fromkeys(numbers, parameter.name)
 
 
-def _require_movable(
-    parameters: Sequence[Parameter], model: Any, mocap: MocapPlacement | None
-) -> None:
+def _require_movable(parameters: Sequence[Parameter], model: Any, mocap: MocapPlacement) -> None:
     """Raise where a parameter moves a mocap body whose pose a keyframe states."""
-    if mocap is None:
-        return
+    for parameter, target in targets_of(parameters):
+        if isinstance(target.field, RotationField):
+            array, row = target.field.whole
+        elif isinstance(target.field, ModelField):
+            array, row = target.field.array, target.field.rows[0]
+        else:
+            continue
 
-    for parameter in parameters:
-        for target in parameter.targets:
-            if isinstance(target.field, RotationField):
-                array, row = target.field.array, target.field.row
-            elif isinstance(target.field, ModelField):
-                array, row = target.field.array, target.field.rows[0]
-            else:
-                continue
-
-            if array in ("body_pos", "body_quat") and row in mocap.bodies:
-                name = element_name(model, "body", row)
-                raise _parameter_error(
-                    parameter,
-                    f"the keyframe states the pose of mocap body {name!r}; remove its mpos and "
-                    "mquat from the keyframe, or the parameter from the experiment",
-                )
+        if array in ("body_pos", "body_quat") and row in mocap.bodies:
+            name = element_name(model, "body", row)
+            raise _parameter_error(
+                parameter,
+                f"the keyframe states the pose of mocap body {name!r}; remove its mpos and mquat "
+                "from the keyframe, or the parameter from the experiment",
+            )
 
 
 def _nominal_values(parameters: Sequence[Parameter], model: Any) -> dict[tuple[str, int], Array]:
     """Values of inertias and orientations in the model, as in `ParameterSet.nominal`."""
     nominal: dict[tuple[str, int], Array] = {}
-    for parameter in parameters:
-        for target in parameter.targets:
-            place = target.field
-            if isinstance(place, InertiaField):
-                try:
-                    place.read(model)
-                except ExperimentError as error:
-                    raise _parameter_error(parameter, str(error)) from None
-                parametrisation = INERTIA_PARAMETRISATIONS[place.parametrisation]
-                inertia = body_inertia(model, place.body)
-                nominal[place.parametrisation, place.body] = parametrisation.coordinates(inertia)
-            elif isinstance(place, RotationField):
-                nominal[place.array, place.row] = np.array(getattr(model, place.array)[place.row])
+    for parameter, target in targets_of(parameters):
+        place = target.field
+        if isinstance(place, InertiaField):
+            try:
+                place.read(model)
+            except ExperimentError as error:
+                raise _parameter_error(parameter, str(error)) from None
+            parametrisation = INERTIA_PARAMETRISATIONS[place.parametrisation]
+            inertia = body_inertia(model, place.body)
+            nominal[place.whole] = parametrisation.coordinates(inertia)
+        elif isinstance(place, RotationField):
+            nominal[place.whole] = np.array(getattr(model, place.array)[place.row])
     return nominal
 
 

@@ -255,9 +255,7 @@ def resolve(
         )
 
     if kind == "option":
-        array = MODEL_ARRAYS["option"][path.field]
-        width = int(np.size(getattr(model.opt, array)))
-        return ModelField(array=array, rows=(path.component_of(width),), in_options=True)
+        return _option_field(model, path)
     if kind == "output":
         return _output_field(path, outputs)
     if kind == "controller":
@@ -478,6 +476,13 @@ def _initial_activation_field(model: Any, path: ParameterPath) -> InitialStateFi
 
     first = 2 * model.nv + int(model.actuator_actadr[actuator])
     return InitialStateField(first + path.component_of(count))
+
+
+def _option_field(model: Any, path: ParameterPath) -> ModelField:
+    """A number of the options of the model."""
+    array = MODEL_ARRAYS["option"][path.field]
+    width = int(np.size(getattr(model.opt, array)))
+    return ModelField(array=array, rows=(path.component_of(width),), in_options=True)
 
 
 def _element_field(model: Any, path: ParameterPath, decoration: Collection[str]) -> TargetField:

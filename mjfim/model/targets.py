@@ -135,6 +135,11 @@ class InertiaField:
     parametrisation: str
     component: int
 
+    @property
+    def whole(self) -> tuple[str, int]:
+        """(parametrisation, body): what is written as a whole."""
+        return self.parametrisation, self.body
+
     def read(self, model: Any) -> float:
         """Value in a model.
 
@@ -182,6 +187,11 @@ class RotationField(DeviationField):
     array: str
     row: int
     component: int
+
+    @property
+    def whole(self) -> tuple[str, int]:
+        """(array, row): what is written as a whole."""
+        return self.array, self.row
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ import numpy as np
 from mjfim.arrays import Array, record
 from mjfim.errors import ExperimentError, ModelError
 from mjfim.model.elements import is_rk4
-from mjfim.model.loading import MAX_EDITED_MODELS, ModelSource
+from mjfim.model.loading import MAX_EDITED_MODELS, ModelSource, silence_mujoco_log
 
 # Tolerance of the constraint solver in private copies. With a larger one, the error of the solver
 # would appear in differences between steps.
@@ -107,18 +107,15 @@ class MocapPlacement:
     start: Array
 
     @staticmethod
-    def of(model: Any, key: Any) -> MocapPlacement | None:
-        """Poses of mocap bodies in a keyframe.
+    def of(model: Any, key: Any) -> MocapPlacement:
+        """Poses of the mocap bodies that a keyframe moves.
 
         Args:
             model: The compiled model (`mujoco.MjModel`).
             key: The keyframe, `model.key(name)`, or None.
-
-        Returns:
-            The poses; None where there is no keyframe or where it moves no mocap body.
         """
         if key is None or model.nmocap == 0:
-            return None
+            return AS_COMPILED
 
         bodies = np.flatnonzero(model.body_mocapid >= 0)
         order = model.body_mocapid[bodies]
@@ -127,13 +124,23 @@ class MocapPlacement:
             [key.mpos.reshape(-1, 3)[order], key.mquat.reshape(-1, 4)[order]], axis=1
         )
         moved = (places != start).any(axis=1)
-
-        return MocapPlacement(bodies[moved], places[moved], start[moved]) if moved.any() else None
+        return MocapPlacement(bodies[moved], places[moved], start[moved])
 
     def put(self, model: Any, places: Array) -> None:
         """Write places: (n, 7) into a model in place."""
         model.body_pos[self.bodies] = places[:, :3]
         model.body_quat[self.bodies] = places[:, 3:]
+
+    def derive_constants(self, model: Any, data: Any) -> None:
+        """Let MuJoCo compute its derived constants anew, from the compiled poses."""
+        self.put(model, self.compiled)
+        with silence_mujoco_log():
+            mujoco.mj_setConst(model, data)
+        self.put(model, self.start)
+
+
+# All mocap bodies where the compiled model has them.
+AS_COMPILED = MocapPlacement(np.zeros(0, np.intp), np.zeros((0, 7)), np.zeros((0, 7)))
 
 
 @record
@@ -199,7 +206,7 @@ class PlantModel:
         sensors: Whether sensor data is wanted; MuJoCo skips the computation otherwise.
         friction: Whether a parameter is a frictionloss, so that the constraint solver must stay on.
         timestep_factor: Factor by which the timestep is longer than stated.
-        mocap: Initial poses of mocap bodies; None for the compiled poses.
+        mocap: Initial poses of mocap bodies.
         relaxation: Clamps, stops and friction that are changed in the copy.
     """
 
@@ -209,7 +216,7 @@ class PlantModel:
     sensors: bool
     friction: bool
     timestep_factor: int = 1
-    mocap: MocapPlacement | None = None
+    mocap: MocapPlacement = AS_COMPILED
     relaxation: Relaxation = field(default_factory=Relaxation)
 
     @cached_property
@@ -280,36 +287,36 @@ class PlantModel:
     def _adapted(self, compiled: Any) -> Any:
         """A copy of a compiled model with the settings of this variant."""
         model = copy.copy(compiled)
+        options = model.opt
 
         self.relaxation.apply(model)
 
         # Work that cannot matter is switched off.
         if not self.sensors:
-            model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_SENSOR
+            options.disableflags |= mujoco.mjtDisableBit.mjDSBL_SENSOR
         if not self.friction and unconstrained(model):
-            model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
+            options.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
         # On one kinematic tree there are no islands to find. Where bodies may sleep, MuJoCo needs
         # the islands for other purposes.
-        if model.ntree == 1 and not model.opt.enableflags & mujoco.mjtEnableBit.mjENBL_SLEEP:
-            model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_ISLAND
+        if model.ntree == 1 and not options.enableflags & mujoco.mjtEnableBit.mjENBL_SLEEP:
+            options.disableflags |= mujoco.mjtDisableBit.mjDSBL_ISLAND
 
         # The single row of a test bench with one joint, whose dry friction may be a parameter, is
         # solved exactly by one pass of projected Gauss-Seidel. With it a step of such a model takes
         # a third less time than with Newton's method. MuJoCo does not solve for it with IPC.
-        has_pass = model.opt.iterations > 0
-        has_pass &= not model.opt.enableflags & mujoco.mjtEnableBit.mjENBL_IPC
+        has_pass = options.iterations > 0
+        has_pass &= not options.enableflags & mujoco.mjtEnableBit.mjENBL_IPC
         if has_pass and allows_dry_friction_only(model) and model.nv + model.ntendon == 1:
-            model.opt.solver = mujoco.mjtSolver.mjSOL_PGS
+            options.solver = mujoco.mjtSolver.mjSOL_PGS
 
-        model.opt.timestep *= self.timestep_factor
+        options.timestep *= self.timestep_factor
 
         # Differences between steps must depend neither on the initial guess of the solver nor on
         # its remaining error.
-        model.opt.tolerance = min(model.opt.tolerance, SOLVER_TOLERANCE)
-        model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_WARMSTART
+        options.tolerance = min(options.tolerance, SOLVER_TOLERANCE)
+        options.disableflags |= mujoco.mjtDisableBit.mjDSBL_WARMSTART
 
-        if self.mocap is not None:
-            self.mocap.put(model, self.mocap.start)
+        self.mocap.put(model, self.mocap.start)
         return self.refresh(model)
 
 

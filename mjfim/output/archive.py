@@ -20,6 +20,7 @@ import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.errors import RecordingError, SimulationDivergedError
+from mjfim.experiment.given import check_fits
 from mjfim.experiment.system import System
 from mjfim.files import read_arrays, relative_name, replacing, write_json
 from mjfim.model.coordinates import (
@@ -163,12 +164,7 @@ def reference_columns(playback: Trajectory, system: System) -> dict[str, Array]:
     for k, data in forward_samples(system.model_at(system.theta), rows, range(len(held))):
         force[k] = data.qfrc_actuator
 
-    # The changes of the velocity over single engine steps.
-    steps = system.stated_grid.playback_steps
-    states = _rollout(system, playback.state[:1], np.repeat(playback.ctrl, steps, axis=0), 1)
-    change = np.diff(system.space.split(states)[1], axis=0) / float(system.model.opt.timestep)
-    qacc = np.concatenate([change[::steps], change[-1:]])
-
+    qacc = _accelerations(playback, system)
     names = [component.name for component in state_components(system.model)]
     dofs = dof_names(system.model)
     columns = {"t": playback.t}
@@ -176,6 +172,14 @@ def reference_columns(playback: Trajectory, system: System) -> dict[str, Array]:
     columns |= dict(zip(names, planned.T, strict=True))
     columns |= {f"qacc:{name}": qacc[:, i] for i, name in enumerate(dofs)}
     return columns | {f"force:{name}": force[:, i] for i, name in enumerate(dofs)}
+
+
+def _accelerations(playback: Trajectory, system: System) -> Array:
+    """(M+1, nv) changes of the velocity over single engine steps, divided by the timestep."""
+    steps = system.stated_grid.playback_steps
+    states = _rollout(system, playback.state[:1], np.repeat(playback.ctrl, steps, axis=0), 1)
+    change = np.diff(system.space.split(states)[1], axis=0) / float(system.model.opt.timestep)
+    return np.concatenate([change[::steps], change[-1:]])
 
 
 def _rollout(system: System, start: Array, ctrl: Array, steps: int) -> Array:
@@ -301,7 +305,7 @@ def write_recording(path: Path, recording: Recording, system: System) -> None:
     write_table(path, {"t": recording.t, **controls, **outputs})
 
 
-def read_design(path: Path) -> dict[str, Trajectory]:
+def read_design(path: Path, system: System) -> dict[str, Trajectory]:
     """Read the trajectories of a design.npz.
 
     The file may come from any version of mjfim or from another program. `Design.load` reads the
@@ -309,13 +313,14 @@ def read_design(path: Path) -> dict[str, Trajectory]:
 
     Args:
         path: The npz file.
+        system: The experiment.
 
     Returns:
         The designed trajectory as `final`, and the initial one as `initial` if the file holds it.
 
     Raises:
         RecordingError: The file cannot be read, lacks an array, or its arrays do not fit each
-            other. Pickles are refused.
+            other or the experiment. Pickles are refused.
     """
     arrays = read_arrays(path, "design")
     missing = [key for key in TRAJECTORY_ARRAYS if key not in arrays]
@@ -323,8 +328,11 @@ def read_design(path: Path) -> dict[str, Trajectory]:
         expected = ", ".join((*TRAJECTORY_ARRAYS, "gain", "sensitivity"))
         raise RecordingError(f"{path}: array {missing[0]!r} is missing; a design holds {expected}")
     has_initial = all(f"initial_{key}" in arrays for key in TRAJECTORY_ARRAYS)
-    initial = {"initial": _trajectory(path, "initial_", arrays)} if has_initial else {}
-    return {**initial, "final": _trajectory(path, "", arrays)}
+    prefixes = {"initial": "initial_", "final": ""} if has_initial else {"final": ""}
+    named = {name: _trajectory(path, prefix, arrays) for name, prefix in prefixes.items()}
+    for trajectory in named.values():
+        check_fits(path, trajectory, system)
+    return named
 
 
 def _trajectory(path: Path, prefix: str, arrays: Mapping[str, np.ndarray]) -> Trajectory:
@@ -341,11 +349,16 @@ def _trajectory(path: Path, prefix: str, arrays: Mapping[str, np.ndarray]) -> Tr
                 f"has the shape {array.shape}"
             )
 
-    periods = np.diff(found["t"].astype(np.float64))
-    mean = float(periods.mean())
+    _require_equal_periods(f"{path}: array '{prefix}t'", found["t"].astype(np.float64))
+    return Trajectory(**found)
+
+
+def _require_equal_periods(name: str, t: Array) -> None:
+    """Raise RecordingError where times do not increase by equal periods."""
+    periods = np.diff(t)
+    mean = periods.mean()
     if mean <= 0.0 or np.abs(periods - mean).max() > SPACING_TOLERANCE * mean:
         raise RecordingError(
-            f"{path}: array '{prefix}t' must increase by equal periods; they are "
-            f"{periods.min():g} s to {periods.max():g} s"
+            f"{name} must increase by equal periods; they are {periods.min():g} s to "
+            f"{periods.max():g} s"
         )
-    return Trajectory(**found)

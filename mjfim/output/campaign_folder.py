@@ -41,7 +41,7 @@ from mjfim.output.words import format_with_uncertainty
 from mjfim.recordings.read import read_recording
 from mjfim.records.design import Design
 from mjfim.records.estimate import Estimate
-from mjfim.records.studies import Campaign, EarlierRound
+from mjfim.records.studies import Campaign, RecordedRound
 
 # Files of the estimate after a round.
 ESTIMATE_ARCHIVE = ("estimate.json", "estimate.npz")
@@ -120,7 +120,7 @@ class CampaignFolder:
             names += [f"{place.name}/{name}" for name in of_round]
         return names
 
-    def recorded_rounds(self) -> Iterator[EarlierRound]:
+    def recorded_rounds(self) -> Iterator[RecordedRound]:
         """Yield the rounds that are recorded, the first one first.
 
         Raises:
@@ -138,16 +138,8 @@ class CampaignFolder:
                 )
 
             check_fits(folder / "design.npz", design.trajectory, self.system)
-            std = design.final.std
-            yield EarlierRound(
-                recordings=tuple(
-                    read_recording(path, self.system.channels) for path in self.recordings(number)
-                ),
-                theta=design.theta,
-                predicted=np.where(np.isnan(std), np.inf, std),
-                control=design.trajectory.ctrl,
-                design=design,
-            )
+            paths = self.recordings(number)
+            yield design, tuple(read_recording(path, self.system.channels) for path in paths)
 
     # ---- additions to the folder
 

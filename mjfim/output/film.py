@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 import platform
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import field, replace
 from importlib import import_module
 from importlib.util import find_spec
@@ -40,7 +40,7 @@ from mjfim.output.rerun.camera import (
     seen_points,
     view_direction,
 )
-from mjfim.output.rerun.scene import BodyPoses, body_poses, has_floor
+from mjfim.output.rerun.scene import body_poses, has_floor
 from mjfim.output.video import Video, require_format, write_video
 from mjfim.records.design import Design, round_share
 from mjfim.records.estimate import Estimate
@@ -93,55 +93,20 @@ Track = tuple[Term, Array]
 
 
 @record
-class FilmView:
-    """One picture of a frame.
-
-    Attributes:
-        tracks: Its robots; those after the first one are transparent ghosts behind it. A robot
-            without a word is not in the title.
-        target: (F, 3) point at which the camera looks in each frame [m].
-        trail: (n, 3) path of the body that the camera follows [m]; empty where it follows none.
-    """
-
-    tracks: tuple[Track, ...]
-    target: Array
-    trail: Array
-
-    @property
-    def named(self) -> dict[Term, bool]:
-        """The words of its robots, and whether they are ghosts."""
-        return {term: k > 0 for k, (term, _) in enumerate(self.tracks) if term}
-
-
-@record
-class FilmCamera:
-    """Camera of all views.
-
-    Attributes:
-        target: (3,) point at which it looks in the first frame [m].
-        offset: (3,) vector from there to the camera [m].
-        floor: Height of a floor that is drawn for models without one [m]; None where it would
-            be seen edge-on, and for models with a floor.
-        spacing: Distance between the lines of this floor [m].
-        size: Width and height of the picture [pixels].
-    """
-
-    target: Array
-    offset: Array
-    floor: float | None
-    spacing: float
-    size: tuple[int, int]
-
-
-@record
 class Film:
-    """A motion in frames.
+    """A motion in frames, each with V views side by side.
 
     Attributes:
         model: The model.
         t: (F,) time of the motion in each frame [s].
-        views: Views side by side.
-        camera: The camera.
+        tracks: The robots of each view; those after the first one are transparent ghosts behind it.
+            A robot without a word is not in the title.
+        targets: (V, F, 3) points at which the camera looks [m].
+        trails: (n, 3) path of the body that the camera follows in each view [m]; empty for none.
+        offset: (3,) vector from the point at which the camera looks to the camera [m].
+        floor: Height of a floor that is drawn for models without one, and distance between its
+            lines [m]; None where it would be seen edge-on, and for models with a floor.
+        size: Width and height of a view [pixels].
         speed: Speed in multiples of real time.
         left_out: Time at the end of the motion that is not shown [s].
         note: Words below the pictures.
@@ -149,11 +114,20 @@ class Film:
 
     model: mujoco.MjModel = field(repr=False)
     t: Array
-    views: tuple[FilmView, ...]
-    camera: FilmCamera
+    tracks: tuple[tuple[Track, ...], ...]
+    targets: Array
+    trails: tuple[Array, ...]
+    offset: Array
+    floor: tuple[float, float] | None
+    size: tuple[int, int]
     speed: float
     left_out: float
     note: str = ""
+
+    @property
+    def named(self) -> list[dict[Term, bool]]:
+        """The words of the robots of each view, and whether they are ghosts."""
+        return [{term: k > 0 for k, (term, _) in enumerate(view) if term} for view in self.tracks]
 
     @property
     def speed_text(self) -> str:
@@ -168,10 +142,10 @@ class Film:
     def caption(self) -> str:
         """One or two sentences that describe the film."""
         pictures = []
-        for view in self.views:
+        for named in self.named:
             robots = [
                 f"the {term} motion{' (transparent)' if is_ghost else ''}"
-                for term, is_ghost in view.named.items()
+                for term, is_ghost in named.items()
             ]
             pictures.append(" and ".join(robots))
         shown = " beside ".join(pictures)
@@ -316,16 +290,22 @@ def film_of_motions(
         scipy.ndimage.uniform_filter1d(path - path[0], window, axis=0, mode="nearest")
         for path in paths
     ] or [np.zeros((frames, 3))] * len(poses)
-    camera = _camera(model, poses, shifts)
-    views = []
-    for k, view in enumerate(tracks):
-        trail = paths[k][points] if paths else nothing
-        views.append(FilmView(tracks=view, target=camera.target + shifts[k], trail=trail))
+    seen = [
+        replace(each, positions=each.positions - shift[:, None])
+        for view, shift in zip(poses, shifts, strict=True)
+        for each in view
+    ]
+    clouds = moving_points(model, seen)
+    target, offset, size = _camera(model, clouds)
     return Film(
         model=model,
         t=t,
-        views=tuple(views),
-        camera=camera,
+        tracks=tuple(tracks),
+        targets=target + np.array(shifts),
+        trails=tuple(path[points] for path in paths) or (nothing,) * len(tracks),
+        offset=offset,
+        floor=_floor(model, clouds, target, offset, np.array(shifts)[..., 2]),
+        size=size,
         speed=speed,
         left_out=end - begin - shown,
     )
@@ -365,16 +345,14 @@ def positions_at(model: mujoco.MjModel, t: Array, qpos: Array, times: Array) -> 
     return found
 
 
-def _camera(
-    model: mujoco.MjModel, poses: Sequence[Sequence[BodyPoses]], shifts: Sequence[Array]
-) -> FilmCamera:
-    """Place a camera that has every motion in view while it is shifted, (F, 3) in each view [m]."""
-    seen = [
-        replace(each, positions=each.positions - shift[:, None])
-        for view, shift in zip(poses, shifts, strict=True)
-        for each in view
-    ]
-    clouds = moving_points(model, seen)
+def _camera(model: mujoco.MjModel, clouds: Sequence[Array]) -> tuple[Array, Array, tuple[int, int]]:
+    """Place a camera that has every motion in view: see `targets`, `offset` and `size` of `Film`.
+
+    Args:
+        model: The model.
+        clouds: (samples, n, 3) paths of the corners of all moving geoms, by motion, without the
+            motion of the camera [m].
+    """
     direction = view_direction(clouds)
     axes = camera_axes(direction)
     points = seen_points(model, clouds) @ axes.T
@@ -383,21 +361,27 @@ def _camera(
     slope = FILLED * float(np.tan(FIELD_OF_VIEW / 2.0))
     fits = [(size, fit_in_view(points, slope, size[0] / size[1])) for size in VIEW_SIZES]
     size, (middle, distance) = max(fits, key=lambda each: each[0][1] / each[1][1])
-    target = middle @ axes
-    offset = distance * direction
-    camera = FilmCamera(target=target, offset=offset, floor=None, spacing=0.0, size=size)
-    if has_floor(model) or direction[2] < EDGE_ON:
-        return camera
+    return middle @ axes, distance * direction, size
 
-    # The floor is below the whole motion.
-    heights = np.concatenate([shift[:, 2] for shift in shifts])
-    lowest = float((points @ axes)[:, 2].min())
-    height = float(target[2] + offset[2] + np.ptp(heights)) - lowest
-    return replace(
-        camera,
-        floor=lowest + float(heights.min()),
-        spacing=FLOOR_SPACING * max(distance, height),
-    )
+
+def _floor(
+    model: mujoco.MjModel, clouds: Sequence[Array], target: Array, offset: Array, shifts: Array
+) -> tuple[float, float] | None:
+    """The floor of a model without one, which is below the whole motion; see `floor` of `Film`.
+
+    Args:
+        model: The model.
+        clouds: As for `_camera`.
+        target: (3,) point at which the camera looks before it is shifted [m].
+        offset: (3,) vector from there to the camera [m].
+        shifts: Vertical shifts of the camera [m].
+    """
+    distance = float(np.linalg.norm(offset))
+    if has_floor(model) or offset[2] < EDGE_ON * distance:
+        return None
+    lowest = float(seen_points(model, clouds)[:, 2].min())
+    height = float(target[2] + offset[2] + np.ptp(shifts)) - lowest
+    return lowest + float(shifts.min()), FLOOR_SPACING * max(distance, height)
 
 
 # Kinds of OpenGL contexts by system, in the order in which they are tried: without a display first.
@@ -422,6 +406,9 @@ LINE_WIDTH = 0.0025
 # its distance, without which surfaces at the same place would be drawn as speckles.
 TINT, KEPT_COLOUR = 0.45, 0.85
 GHOST_TINT, GHOST_OPACITY, GHOST_SHIFT = 0.9, 0.4, 0.002
+
+# What is drawn of a ghost: bodies without geoms are decoration, which shows their inertia.
+GHOST_PARTS = int(mujoco.mjtCatBit.mjCAT_DYNAMIC | mujoco.mjtCatBit.mjCAT_DECOR)
 
 # How much stronger than its colour a thing is that shines by itself, so that lights add little; and
 # the distance of the background, as a share of that of the far clipping plane.
@@ -469,7 +456,8 @@ class Painter:
             NoVideoError: There is no usable OpenGL.
         """
         model = film.model
-        count, (width, height) = len(film.views), film.camera.size
+        count = len(film.tracks)
+        width, height = film.size
         self.width = count * width + (count - 1) * GAP
         self.height = TITLE_HEIGHT + height + FOOT_HEIGHT
         self._film = film
@@ -480,7 +468,7 @@ class Painter:
             int(mujoco.mjtObj.mjOBJ_BODY): model.body_weldid != 0,
         }
         self._has_sky = bool(np.any(model.tex_type == int(mujoco.mjtTexture.mjTEXTURE_SKYBOX)))
-        self._camera = _free_camera(film.camera.offset)
+        self._camera = _free_camera(film.offset)
         self._option = mujoco.MjvOption()
         if not np.any(model.geom_group[moves] < SHOWN_GROUPS):
             self._option.geomgroup[:] = 1
@@ -507,8 +495,8 @@ class Painter:
     def frame(self, k: int) -> NDArray[np.uint8]:
         """Draw a frame by its number: (height, width, 3) bytes."""
         frame = self._paper.copy()
-        for i, view in enumerate(self._film.views):
-            left = i * (self._film.camera.size[0] + GAP)
+        for view in range(len(self._film.tracks)):
+            left = view * (self._film.size[0] + GAP)
             frame.paste(Image.fromarray(self._picture(view, k)), (left, TITLE_HEIGHT))
 
         text = ImageDraw.Draw(frame)
@@ -520,17 +508,8 @@ class Painter:
         """What is equal in all frames: the titles and the speed."""
         paper = Image.new("RGB", (self.width, self.height), PAPER)
         text = ImageDraw.Draw(paper)
-        bold, plain = _font("DejaVuSans-Bold.ttf", TITLE_SIZE), _font("DejaVuSans.ttf", TITLE_SIZE)
-        for k, view in enumerate(self._film.views):
-            x = float(k * (self._film.camera.size[0] + GAP) + MARGIN)
-            for j, (term, is_ghost) in enumerate(view.named.items()):
-                words = [(" and " if j else "", FAINT_INK, plain), (term, term.rgb, bold)]
-                # Of three words, there is no room for more.
-                is_told = is_ghost and len(view.named) == 2
-                words.append((" (transparent)" if is_told else "", FAINT_INK, plain))
-                for word, colour, font in words:
-                    text.text((x, TITLE_HEIGHT // 2), word, colour, font, anchor="lm")
-                    x += font.getlength(word)
+        for k, named in enumerate(self._film.named):
+            _write_title(text, float(k * (self._film.size[0] + GAP) + MARGIN), named)
 
         place = (self.width - MARGIN, self.height - FOOT_HEIGHT // 2)
         text.text(place, self._film.speed_text, FAINT_INK, self._font, anchor="rm")
@@ -540,28 +519,36 @@ class Painter:
 
     # ---- the scene
 
-    def _picture(self, view: FilmView, k: int) -> NDArray[np.uint8]:
-        model, data, scene = self._film.model, self._data, self._renderer.scene
-        self._camera.lookat[:] = view.target[k]
-        for layer, (term, qpos) in enumerate(view.tracks):
-            data.qpos[:] = qpos[k]
-            mujoco.mj_fwdPosition(model, data)
-            first = scene.ngeom if layer else 0
-            if layer:
-                # Bodies without geoms are decoration, which shows their inertia.
-                kinds = int(mujoco.mjtCatBit.mjCAT_DYNAMIC | mujoco.mjtCatBit.mjCAT_DECOR)
-                mujoco.mjv_addGeoms(model, data, self._option, mujoco.MjvPerturb(), kinds, scene)
-            else:
-                self._renderer.update_scene(data, self._camera, self._option)
-            self._paint(term, first, layer)
+    def _picture(self, view: int, k: int) -> NDArray[np.uint8]:
+        """The robots of a view in a frame."""
+        film = self._film
+        target = film.targets[view, k]
+        self._camera.lookat[:] = target
+        for layer, (term, qpos) in enumerate(film.tracks[view]):
+            self._add_robot(term, qpos[k], layer)
 
-        colour = (*(np.array(view.tracks[0][0].rgb) / 255.0), 1.0)
-        for begin, end in pairwise(view.trail):
-            _add_line(scene, begin, end, LINE_WIDTH * self._camera.distance, colour)
-        self._add_floor(view.target[k])
+        lead, _ = film.tracks[view][0]
+        colour = (*(np.array(lead.rgb) / 255.0), 1.0)
+        width = LINE_WIDTH * self._camera.distance
+        for begin, end in pairwise(film.trails[view]):
+            _add_line(self._renderer.scene, begin, end, width, colour)
+        self._add_floor(target)
         if not self._has_sky:
             self._add_background()
         return np.asarray(self._renderer.render())
+
+    def _add_robot(self, term: Term, qpos: Array, layer: int) -> None:
+        """Add a robot at qpos: (nq,) to the scene, which the first one begins anew."""
+        model, data, scene = self._film.model, self._data, self._renderer.scene
+        data.qpos[:] = qpos
+        mujoco.mj_fwdPosition(model, data)
+        if not layer:
+            self._renderer.update_scene(data, self._camera, self._option)
+            self._paint(term, 0, layer)
+            return
+        first = scene.ngeom
+        mujoco.mjv_addGeoms(model, data, self._option, mujoco.MjvPerturb(), GHOST_PARTS, scene)
+        self._paint(term, first, layer)
 
     def _paint(self, term: Term, first: int, layer: int) -> None:
         """Tint the moving parts that were added to the scene from the number `first` on.
@@ -579,23 +566,23 @@ class Painter:
                 geom.rgba[:3] = (1.0 - share) * own + share * np.array(term.rgb) / 255.0
                 geom.rgba[3] *= GHOST_OPACITY if layer else 1.0
                 if layer:
-                    geom.pos[:] -= layer * GHOST_SHIFT * self._film.camera.offset
+                    geom.pos[:] -= layer * GHOST_SHIFT * self._film.offset
 
     def _add_floor(self, target: Array) -> None:
         """Add the lines of a floor around the point at which the camera looks."""
-        camera = self._film.camera
-        if camera.floor is None:
+        if self._film.floor is None:
             return
-        middle = camera.spacing * np.round(target[:2] / camera.spacing)
-        reach = FLOOR_LINES * camera.spacing
-        for shift in camera.spacing * np.arange(-FLOOR_LINES, FLOOR_LINES + 1):
+        height, spacing = self._film.floor
+        middle = spacing * np.round(target[:2] / spacing)
+        reach = FLOOR_LINES * spacing
+        for shift in spacing * np.arange(-FLOOR_LINES, FLOOR_LINES + 1):
             for along in (0, 1):
-                begin = np.array([*middle, camera.floor])
+                begin = np.array([*middle, height])
                 begin[1 - along] += shift
                 end = begin.copy()
                 begin[along] -= reach
                 end[along] += reach
-                width = FLOOR_WIDTH * camera.spacing
+                width = FLOOR_WIDTH * spacing
                 _add_line(self._renderer.scene, begin, end, width, FLOOR_COLOUR)
 
     def _add_background(self) -> None:
@@ -607,6 +594,19 @@ class Painter:
         turn = np.stack([np.cross(forward, up), up, -forward], axis=1)
         size = distance * np.array([2.0, 2.0, 1e-3])
         _add_box(scene, size, position + distance * forward, turn, BACKGROUND)
+
+
+def _write_title(text: ImageDraw.ImageDraw, x: float, named: Mapping[Term, bool]) -> None:
+    """Write the words of the robots of a view from a place on, and which robots are ghosts."""
+    bold, plain = _font("DejaVuSans-Bold.ttf", TITLE_SIZE), _font("DejaVuSans.ttf", TITLE_SIZE)
+    for j, (term, is_ghost) in enumerate(named.items()):
+        words = [(" and " if j else "", FAINT_INK, plain), (term, term.rgb, bold)]
+        # Of three words, there is no room for more.
+        is_told = is_ghost and len(named) == 2
+        words.append((" (transparent)" if is_told else "", FAINT_INK, plain))
+        for word, colour, font in words:
+            text.text((x, TITLE_HEIGHT // 2), word, colour, font, anchor="lm")
+            x += font.getlength(word)
 
 
 # Red, green, blue and opacity (0..1).

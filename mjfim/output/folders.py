@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from mjfim.arrays import Array
 from mjfim.errors import ModelError, RecordingError
 from mjfim.experiment.system import System, labels_of_system
 from mjfim.files import read_json, remove_earlier_result, replacing
@@ -36,9 +37,10 @@ from mjfim.parallel.budget import current_interruption
 from mjfim.records.base import ShownRecord
 from mjfim.records.check import Check
 from mjfim.records.design import Design
-from mjfim.records.estimate import Estimate
+from mjfim.records.estimate import Estimate, ParameterDraws
 from mjfim.records.events import begin_stage
 from mjfim.records.studies import Campaign, Comparison, MonteCarloStudy
+from mjfim.records.trajectory import with_unit
 
 # Table of the drawn robots, and folder of their models.
 SAMPLES_TABLE = "samples.csv"
@@ -56,34 +58,31 @@ def sample_files(folder: Path) -> tuple[str, ...]:
     return (SAMPLES_TABLE, *(f"{SAMPLES_FOLDER}/{file.name}" for file in models))
 
 
-def write_samples(folder: Path, estimate: Estimate, system: System) -> list[str]:
+def write_samples(folder: Path, draws: ParameterDraws, theta: Array, system: System) -> list[str]:
     """Write the table and the models of the robots that are drawn from an estimate.
 
     Models are written for all robots or for none.
 
     Args:
         folder: Folder of the estimate.
-        estimate: An estimate with draws.
+        draws: The robots.
+        theta: (p,) the estimate.
         system: The system that was identified.
 
     Returns:
         Sentences about models that could not be written completely.
     """
-    draws = estimate.draws
-    assert draws is not None
-    columns: dict[str, np.ndarray] = {"robot": np.arange(1, len(draws) + 1)}
-    for name, unit, values in zip(draws.parameters, draws.units, draws.values.T, strict=True):
-        columns[f"{name} [{unit}]" if unit else name] = values
-    write_table(folder / SAMPLES_TABLE, columns)
+    columns = dict(zip(map(with_unit, draws.parameters, draws.units), draws.values.T, strict=True))
+    write_table(folder / SAMPLES_TABLE, {"robot": np.arange(1, len(draws) + 1), **columns})
 
     # Robots differ in their numbers alone, so that a remark stands for all of them.
     remarks: Counter[str] = Counter()
-    theta = np.array(estimate.theta)
-    for i in range(len(draws)):
-        path = folder / SAMPLES_FOLDER / f"{ROBOT.format(i + 1)}.xml"
-        theta[~system.parameters.initial_deviations] = draws.values[i]
+    drawn = theta.copy()
+    for i, values in enumerate(draws.values, start=1):
+        path = folder / SAMPLES_FOLDER / f"{ROBOT.format(i)}.xml"
+        drawn[~system.parameters.initial_deviations] = values
         try:
-            found = write_identified(path, system, theta)
+            found = write_identified(path, system, drawn)
         except ModelError as error:
             _clear_models(folder / SAMPLES_FOLDER)
             return [f"no models of drawn robots were written: {error}"]
@@ -288,10 +287,12 @@ def _write_data(
         remarks = write_identified(folder / IDENTIFIED, system, record.theta, record)
     except ModelError as error:
         remarks = [str(error)]
-    if record.draws is not None:
+    draws = record.draws
+    if draws is not None:
         begin_stage("writing the models of the drawn robots")
         write_optional(
-            "the drawn robots", lambda: remarks.extend(write_samples(folder, record, system))
+            "the drawn robots",
+            lambda: remarks.extend(write_samples(folder, draws, record.theta, system)),
         )
     return remarks
 

@@ -319,11 +319,11 @@ def range_of_intervals(centre: Array, low: Array, high: Array) -> tuple[float, f
         low: (n,) their lower ends.
         high: (n,) their upper ends.
     """
-    known = np.isfinite(centre) & np.isfinite(low) & np.isfinite(high)
+    known = np.isfinite([centre, low, high]).all(axis=0)
     if not known.any():
         return -1.0, 1.0
     centre, low, high = centre[known], low[known], high[known]
-    usual = float(np.median(high - low)) / 2.0
+    usual = np.median(high - low) / 2.0
     distance = np.abs(centre - np.median(centre))
     shown = distance <= FARTHEST * max(usual, float(np.median(distance)))
     begin = float(np.maximum(low, centre - NEAR * usual)[shown].min())

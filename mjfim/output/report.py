@@ -251,21 +251,20 @@ def write_report(folder: Path, made: ShownRecord | None = None, media: Media | N
     Raises:
         RecordingError: A result cannot be read, or there is none.
     """
-    records = []
+    file = folder / REPORT
+    design = folder if (folder / "design.npz").is_file() else None
+    records: list[ShownRecord] = []
+    names = []
+    pages = []
     for kind in kinds_in(folder):
-        if isinstance(made, kind):
-            records.append(made.as_saved())
-            continue
         # A result of an earlier version, which cannot be read, is left out beside a new one.
         try:
-            records.append(kind.load(folder))
+            record = made.as_saved() if isinstance(made, kind) else kind.load(folder)
         except RecordingError:
             if made is None:
                 raise
-    file = folder / REPORT
-    design = folder if (folder / "design.npz").is_file() else None
-    names, pages = [], []
-    for record in records:
+            continue
+        records.append(record)
         stated = _stated(folder, record)
         names.append(_name(folder, record, stated))
         experiment = stated.get("experiment")

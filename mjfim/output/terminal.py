@@ -108,21 +108,26 @@ def _styled(text: str, style: str) -> Styled:
 def _shortened(parts: Sequence[Shown], width: int, lines: int) -> tuple[list[Shown], int]:
     """Leave out explanations, and then rows, until the parts have few enough lines."""
     shown = list(parts)
+
+    def height() -> int:
+        return sum(_height(part, width) for part in shown)
+
     for part in parts:
         is_explanation = isinstance(part, Text) and part.emphasis is Emphasis.WEAK
-        if is_explanation and sum(_height(each, width) for each in shown) > lines:
+        if is_explanation and height() > lines:
             shown.remove(part)
     results = next((i for i, part in enumerate(shown) if isinstance(part, Table)), -1)
     hidden = 0
-    while sum(_height(part, width) for part in shown) > lines - bool(hidden):
+    while height() > lines - bool(hidden):
         spare = [
             _count(part) - (FEWEST_RESULTS if i == results else FEWEST)
             for i, part in enumerate(shown)
         ]
-        highest = max(range(len(shown)), key=spare.__getitem__, default=0)
-        if not spare or spare[highest] <= 0:
+        most = max(spare, default=0)
+        if most <= 0:
             break
-        shown[highest] = _without_last(shown[highest])
+        longest = spare.index(most)
+        shown[longest] = _without_last(shown[longest])
         hidden += 1
     return shown, len(parts) - len(shown) + hidden
 

@@ -131,7 +131,7 @@ def units_of(channels: Channels) -> dict[str, str]:
 
     units.update(dict.fromkeys(channels.control_columns, ANY))
     inputs = () if channels.laws is None else channels.laws.inputs
-    return units | {c.name: c.unit for c in inputs if c.unit in VALID_UNITS}
+    return units | {name: unit for name, unit, _ in inputs if unit in VALID_UNITS}
 
 
 # ---- columns that control laws read in place of controls

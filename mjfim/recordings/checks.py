@@ -336,17 +336,14 @@ def _doubtful_references(
     if channels.laws is None:
         return
     for law in channels.laws.laws:
-        column = channels.laws.inputs[law.columns["reference"]]
-        q, r = columns.get(f"qpos:{law.joint}"), columns.get(column.name)
-        if q is None or r is None or column.unit != ANGLE:
+        name, unit, _ = channels.laws.inputs[law.columns["reference"]]
+        q, r = columns.get(f"qpos:{law.joint}"), columns.get(name)
+        if q is None or r is None or unit != ANGLE:
             continue
         both = np.isfinite(q) & np.isfinite(r)
         ratio = _ratio(q[both] - q[both].mean(), r[both] - r[both].mean())
         if abs(ratio / DEGREES - 1.0) < TOLERANCE:
-            yield (
-                column.name,
-                f"{column.name!r} moves {ratio:.3g} times as far as 'qpos:{law.joint}'",
-            )
+            yield name, f"{name!r} moves {ratio:.3g} times as far as 'qpos:{law.joint}'"
 
 
 def _slope_ratio(t: Array, q: Array, v: Array) -> float:

@@ -215,9 +215,6 @@ class SavedRecord(Record):
         if version != VERSION:
             raise RecordingError(f"{path}: has version {version}, not {VERSION}; {advice}")
 
-        # Records share arrays that nobody can change.
-        for array in arrays.values():
-            array.setflags(write=False)
         try:
             made: Self = _reader(cls).validate_json(  # type: ignore[arg-type]
                 json.dumps(values), strict=True, context=dict(arrays)

@@ -10,7 +10,7 @@ import numpy as np
 from mjfim.arrays import NORMAL_95, Array, finite_or_nan, record
 from mjfim.errors import first_ones, shortened
 from mjfim.records.base import ParameterResult, ParameterValue, Record, no_array
-from mjfim.records.design import CombinationAccuracy, LimitViolation
+from mjfim.records.design import LimitViolation
 from mjfim.records.rehearsal import FiniteSteps, Rehearsal, Valley
 from mjfim.records.worth import Worth
 
@@ -262,8 +262,7 @@ class Check(ParameterResult):
             well, and for recordings.
         is_start: Whether the motion is the initial control, at which a design begins.
         findings: What the check found, in sentences, the most serious first.
-        combined: Accuracies of the identifiable combinations; their `std_initial` and `std_final`
-            are equal.
+        combined: The identifiable combinations; their `std_initial` and `std` are equal.
         missing: What was not computed because the check was stopped, in words; empty where it is
             complete.
         refused: Reasons why `mjfim design` refuses the experiment, in its own words.
@@ -288,7 +287,7 @@ class Check(ParameterResult):
     worth: Worth | None = None
     valley: Valley | None = None
     is_start: bool = False
-    combined: tuple[CombinationAccuracy, ...] = ()
+    combined: tuple[ParameterValue, ...] = ()
     missing: tuple[str, ...] = ()
     refused: tuple[str, ...] = ()
     violations: tuple[LimitViolation, ...] = ()
@@ -380,9 +379,7 @@ class Check(ParameterResult):
 
     def summary(self) -> dict[str, Any]:
         """The contents of the record in JSON."""
-        combined = [
-            {"words": c.expression, "value": c.value, "std": c.std_final} for c in self.combined
-        ]
+        combined = [{"words": c.name, "value": c.value, "std": c.std} for c in self.combined]
         return {
             **super().summary(),
             "complete": not self.missing,
@@ -464,27 +461,33 @@ def _about_identifiability(check: Check) -> Iterator[str]:
         )
 
 
+def _fault(missed: Sequence[ParameterCheck]) -> str:
+    """What is wrong with the σ of parameters, which all state a wanted one, or none of them."""
+    few = len(missed) == 1
+    if missed[0].stated:
+        return f"{'misses' if few else 'miss'} the wanted σ"
+    return f"{'has' if few else 'have'} a σ of more than 5 % of {'its' if few else 'their'} size"
+
+
+def _needed(missed: Sequence[ParameterCheck]) -> str:
+    """Repetitions that the least accurate parameter needs."""
+    worst = max(missed, key=lambda row: row.std / row.wanted)
+    needed = "no number of repetitions reaches"
+    if worst.repetitions:
+        needed = f"{worst.repetitions:,} repetitions ({worst.seconds:,.0f} s) reach"
+    return f"the worst is {worst.name}: {needed} {worst.wanted:.3g} {worst.unit}".rstrip()
+
+
 def _about_accuracy(check: Check, identifiable: Sequence[ParameterCheck]) -> Iterator[str]:
     """Comparison of the predicted standard deviations with the wanted ones."""
     missed = [row for row in identifiable if row.repetitions != 1]
-    stated = [row for row in missed if row.stated]
     if missed:
         # Nobody wants 5 %, but it shows how many repetitions a usual accuracy needs.
-        worst = max(stated or missed, key=lambda row: row.std / row.wanted)
-        few = len(stated or missed) == 1
-        fault = (
-            f"{'has' if few else 'have'} a σ of more than 5 % of {'its' if few else 'their'} size"
-        )
-        if stated:
-            fault = f"{'misses' if few else 'miss'} the wanted σ"
-        needed = "no number of repetitions reaches"
-        if worst.repetitions:
-            needed = f"{worst.repetitions:,} repetitions ({worst.seconds:,.0f} s) reach"
-        wanted = f"{worst.wanted:.3g} {worst.unit}".rstrip()
+        missed = [row for row in missed if row.stated] or missed
         yield (
-            f"{len(stated or missed)} of {len(identifiable)} parameters {fault} with "
-            f"{check.source} alone; the worst is {worst.name}: {needed} {wanted}. A designed "
-            "excitation (`mjfim design`) needs fewer"
+            f"{len(missed)} of {len(identifiable)} parameters {_fault(missed)} with "
+            f"{check.source} alone; {_needed(missed)}. A designed excitation (`mjfim design`) "
+            "needs fewer"
         )
         return
     is_certain = check.self_test.passed and not check.missing

@@ -31,41 +31,29 @@ TIE_TOLERANCE = 2e-2
 MAX_MOTIONS, MOTION_SAMPLES = 40, 200
 
 
-@record
-class IterateMotion(Record):
-    """Motion of one iterate at `MOTION_SAMPLES` evenly spread samples, n in all.
+# Motion of one iterate at `MOTION_SAMPLES` evenly spread samples: (n,) times [s], (n, nq) positions
+# [m or rad; unit quaternions for ball and free joints], and (n, nu) controls, of which the last one
+# is repeated at the end [unit of the actuator].
+IterateMotion = tuple[Array, Array, Array]
 
-    Attributes:
-        t: (n,) times [s].
-        qpos: (n, nq) positions [m or rad; unit quaternions for ball and free joints].
-        ctrl: (n, nu) controls; the last one is repeated at the end [unit of the actuator].
+
+def iterate_motion(trajectory: Trajectory | None) -> IterateMotion | None:
+    """Thin the trajectory of an iterate.
+
+    Args:
+        trajectory: The trajectory; None for an iterate whose simulation diverged.
+
+    Returns:
+        The motion; None without a trajectory, and where it is not finite.
     """
+    if trajectory is None or not np.isfinite(trajectory.qpos).all():
+        return None
 
-    t: Array
-    qpos: Array
-    ctrl: Array
-
-    @classmethod
-    def of(cls, trajectory: Trajectory | None) -> IterateMotion | None:
-        """Thin a trajectory.
-
-        Args:
-            trajectory: The trajectory; None for an iterate whose simulation diverged.
-
-        Returns:
-            The motion; None without a trajectory, and where it is not finite.
-        """
-        if trajectory is None or not np.isfinite(trajectory.qpos).all():
-            return None
-
-        # A trajectory with fewer samples repeats some, so that all motions have the same size.
-        last = trajectory.samples
-        rows = np.linspace(0, last, MOTION_SAMPLES).round().astype(np.intp)
-        return cls(
-            t=_drawn(trajectory.t[rows]),
-            qpos=_drawn(trajectory.qpos[rows]),
-            ctrl=_drawn(trajectory.ctrl[np.minimum(rows, last - 1)]),
-        )
+    # A trajectory with fewer samples repeats some, so that all motions have the same size.
+    last = trajectory.samples
+    rows = np.linspace(0, last, MOTION_SAMPLES).round().astype(np.intp)
+    ctrl = trajectory.ctrl[np.minimum(rows, last - 1)]
+    return _drawn(trajectory.t[rows]), _drawn(trajectory.qpos[rows]), _drawn(ctrl)
 
 
 def _drawn(values: Array) -> Array:
@@ -103,13 +91,9 @@ class IterateMotions(Record):
         """
         if not motions:
             return None
-        return cls(
-            iteration=np.array([iteration for iteration, _ in motions], dtype=np.float64),
-            **{
-                name: np.stack([getattr(motion, name) for _, motion in motions])
-                for name in ("t", "qpos", "ctrl")
-            },
-        )
+        t, qpos, ctrl = map(np.stack, zip(*(motion for _, motion in motions), strict=True))
+        iterations = np.array([iteration for iteration, _ in motions], dtype=np.float64)
+        return cls(iteration=iterations, t=t, qpos=qpos, ctrl=ctrl)
 
 
 # When a controller should use the gains, for design.json and the player.
@@ -326,25 +310,6 @@ class StartResult(Record):
 
 
 @record
-class CombinationAccuracy(Record):
-    """Accuracy of an identifiable combination of parameters that are not identifiable alone.
-
-    Attributes:
-        expression: The combination in words, for example `m + 2 l`.
-        value: Its value at the theta of the design.
-        std_initial: Its standard deviation after the initial experiment.
-        std_final: Its standard deviation after the designed experiment.
-    """
-
-    expression: str
-    value: float
-    std_initial: float
-    std_final: float
-
-    json_names = {"expression": "words"}
-
-
-@record
 class LimitUsage(Record):
     """Position of a trajectory between the two bounds of one limit.
 
@@ -462,7 +427,8 @@ class Design(ParameterResult):
         starts: Results of all initial controls.
         nuisance: Names of the nuisance parameters.
         combinations: Groups of parameters that are not identifiable alone, in words.
-        combined: Accuracies of the identifiable combinations of these groups.
+        combined: The identifiable combinations of these groups, such as `m + 2 l`, with σ after
+            the designed experiment, and σ after the initial one as `std_initial`.
         prior: (p, p) information known before this experiment [1 / (unit of theta_i times unit of
             theta_j)].
         data: (p, p) information of this experiment alone, in which nuisance parameters that
@@ -502,7 +468,7 @@ class Design(ParameterResult):
     starts: tuple[StartResult, ...] = ()
     nuisance: tuple[str, ...] = ()
     combinations: tuple[str, ...] = ()
-    combined: tuple[CombinationAccuracy, ...] = ()
+    combined: tuple[ParameterValue, ...] = ()
     prior: Array = no_array(0, 0)
     data: Array = no_array(0, 0)
     labels: Labels
@@ -590,8 +556,8 @@ class Design(ParameterResult):
         wanted = list(self.wanted)
         before = [self.initial.cost, *self.initial.std[wanted]]
         after = [self.final.cost, *self.final.std[wanted]]
-        before += [each.std_initial for each in self.combined]
-        after += [each.std_final for each in self.combined]
+        before += [each.further["std_initial"] for each in self.combined]
+        after += [each.std for each in self.combined]
         return np.allclose(before, after, rtol=TIE_TOLERANCE, atol=0.0)
 
     @property
@@ -673,6 +639,12 @@ class Design(ParameterResult):
         )
 
     @property
+    def rows(self) -> list[ParameterValue]:
+        """The wanted parameters and the combinations of others, with σ of both motions."""
+        every = list(self.each())
+        return [*(every[j] for j in self.wanted), *self.combined]
+
+    @property
     def iterations(self) -> int:
         """Number of the last iterate; 0 if there is none."""
         return self.history[-1].iteration if self.history else 0
@@ -693,6 +665,15 @@ class Design(ParameterResult):
                 for j in np.flatnonzero(np.isfinite(targets)).tolist()
             },
             "gains": GAIN_NOTE,
+            "combined": [
+                {
+                    "words": each.name,
+                    "value": each.value,
+                    "std_initial": each.further["std_initial"],
+                    "std_final": each.std,
+                }
+                for each in self.combined
+            ],
             "limits": {
                 "margins": self.limits,
                 "satisfied": keeps_limits(self),

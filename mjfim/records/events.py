@@ -87,7 +87,7 @@ _observer: ContextVar[Callable[[str, int, int], None] | None] = ContextVar(
 
 
 # Module that shows progress in a notebook.
-NOTEBOOK_PROGRESS = "mjfim.output.progress_text"
+NOTEBOOK_PROGRESS = "mjfim.output.live"
 
 
 # Event that a callback takes.

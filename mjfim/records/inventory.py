@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
+from operator import attrgetter, itemgetter
 from typing import Any
 
 from mjfim.arrays import Array, record
@@ -12,29 +13,24 @@ from mjfim.records.estimate import ControlLawInLoop
 from mjfim.records.rehearsal import LimitRange
 
 # Kinds of entries, the names of the fields of `Inventory` that hold them, and what names an entry.
-KINDS = {
-    "parameters": "path",
-    "outputs": "name",
-    "actuators": "name",
-    "keyframes": "name",
-    "limits": "path",
-    "terms": "kind",
+KINDS: Mapping[str, Callable[[Any], str]] = {
+    "parameters": itemgetter(0),
+    "outputs": attrgetter("name"),
+    "actuators": itemgetter(0),
+    "keyframes": attrgetter("name"),
+    "limits": attrgetter("path"),
+    "terms": attrgetter("kind"),
 }
 
 
-@record
-class ListedParameter(Record):
-    """A number of the model that a parameter can set.
+# A number of the model that a parameter can set: parameter path for `target`, value in the model
+# [unit], None where the compiled model does not hold it, and unit, which is empty where it has
+# none, or where it depends on the model.
+ListedParameter = tuple[str, float | None, str]
 
-    Attributes:
-        path: Parameter path for `target`.
-        value: Value in the model [unit]; None where the compiled model does not hold it.
-        unit: Its unit; empty where it has none, or where it depends on the model.
-    """
-
-    path: str
-    value: float | None
-    unit: str
+# An actuator: its name, a column of control tables, what it acts on, for example `joint hinge`, and
+# the unit of its control, which is empty where it is not evident from the model.
+ListedActuator = tuple[str, str, str]
 
 
 @record
@@ -52,21 +48,6 @@ class ListedOutput(Record):
     source: str
     unit: str
     noise: float
-
-
-@record
-class ListedActuator(Record):
-    """An actuator.
-
-    Attributes:
-        name: Name of the actuator, a column of control tables.
-        drives: What it acts on, for example `joint hinge`.
-        unit: Unit of its control; empty where it is not evident from the model.
-    """
-
-    name: str
-    drives: str
-    unit: str
 
 
 @record
@@ -138,8 +119,8 @@ class Inventory(Record):
             The selection; the remarks stay.
         """
         chosen: dict[str, Any] = {
-            kind: tuple(entry for entry in getattr(self, kind) if matches(getattr(entry, key)))
-            for kind, key in KINDS.items()
+            kind: tuple(entry for entry in getattr(self, kind) if matches(name_of(entry)))
+            for kind, name_of in KINDS.items()
         }
         return replace(self, **chosen)
 
@@ -159,6 +140,15 @@ class Inventory(Record):
     def count(self) -> int:
         """Number of entries."""
         return sum(len(getattr(self, kind)) for kind in KINDS)
+
+    def summary(self) -> dict[str, Any]:
+        """The contents of the record in JSON."""
+        keys, drives = ("path", "value", "unit"), ("name", "drives", "unit")
+        return {
+            **super().summary(),
+            "parameters": [dict(zip(keys, each, strict=True)) for each in self.parameters],
+            "actuators": [dict(zip(drives, each, strict=True)) for each in self.actuators],
+        }
 
 
 @record

@@ -516,7 +516,6 @@ class Rehearsal(ShownRecord):
 
     def summary(self) -> dict[str, Any]:
         """The contents of the record in JSON."""
-        measured = ("lowest", "end_height", "nearest", "in_contact", "at_stop")
         return {
             **super().summary(),
             "limits": [
@@ -536,28 +535,25 @@ class Rehearsal(ShownRecord):
                     "name": name,
                     "unit": self.units[i],
                     **{
-                        key: {"model": float(each[0, i]), "robots": _worst(each[1:, i])}
-                        for key, each in (
-                            ("speed", self.speed),
-                            ("acceleration", self.acceleration),
-                            ("end_speed", self.end_speed),
-                            ("travel", self.travel),
-                        )
+                        key: _of_robots(getattr(self, key)[:, i], key)
+                        for key in ("speed", "acceleration", "end_speed", "travel")
                     },
                 }
                 for i, name in enumerate(self.joints)
             ],
             **{
-                key: {"model": float(each[0]), "robots": _worst(each[1:], key)}
-                for key, each in ((name, getattr(self, name)) for name in measured)
+                key: _of_robots(getattr(self, key), key)
+                for key in ("lowest", "end_height", "nearest", "in_contact", "at_stop")
             },
         }
 
 
-def _worst(values: Array, key: str = "") -> float:
-    """The worst of the values of all robots: the smallest height or distance, else the largest."""
-    known = values[np.isfinite(values)]
-    if not len(known):
-        return float("nan")
+def _of_robots(values: Array, key: str) -> dict[str, float]:
+    """The value of the model, and the worst one of all robots; NaN where none is known.
+
+    The worst one is the smallest height or distance, or else the largest value.
+    """
+    known = values[1:][np.isfinite(values[1:])]
     is_least = key in ("lowest", "end_height", "nearest")
-    return float(known.min() if is_least else known.max())
+    worst = known.min(initial=np.inf) if is_least else known.max(initial=-np.inf)
+    return {"model": float(values[0]), "robots": float(worst) if len(known) else float("nan")}

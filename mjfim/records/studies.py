@@ -355,25 +355,9 @@ class CampaignStatus(NamedEnum):
     INTERRUPTED = "interrupted by the user; the rounds so far are complete"
 
 
-@record
-class EarlierRound(Record):
-    """Recordings that existed before this session of a campaign began.
-
-    They belong to a round of an earlier session, or were made without a design.
-
-    Attributes:
-        recordings: The recordings.
-        theta: (p,) parameters at which the round was designed [theta-unit]; None without a design.
-        predicted: (p,) predicted standard deviations [theta-unit]; None without a design.
-        control: (N, nu) control of the design [unit of the actuator]; None without a design.
-        design: The design, where all of it is known.
-    """
-
-    recordings: tuple[Recording, ...]
-    theta: Array | None = None
-    predicted: Array | None = None
-    control: Array | None = None
-    design: Design | None = None
+# The design of a round that is recorded, None for recordings that were made without one, and its
+# recordings.
+RecordedRound = tuple[Design | None, tuple[Recording, ...]]
 
 
 @record
@@ -388,7 +372,7 @@ class Round(Record):
         control: (N, nu) control of the design [unit of the actuator].
         recordings: Recordings of this round.
         estimate: Estimate from all recordings up to this round.
-        design: The design; None where it is not known.
+        design: The design; None for recordings that were made without one.
         warnings: Sentences for the user.
     """
 

@@ -391,22 +391,11 @@ class SelectionStep(Record):
         return self.decision is Decision.REJECTED and self.reduction <= 0.0
 
 
-@record
-class HeldOutRefit(Record):
-    """Fit of the selected model to the held-out recordings, which took no part in the selection.
-
-    Its intervals do not depend on how the terms were chosen.
-
-    Attributes:
-        theta: (p,) estimate [theta-unit].
-        interval: (p, 2) 95 % intervals [theta-unit].
-        differs: Names of the common parameters that differ from those of the fitted recordings by
-            more than both intervals explain; one by chance in 5 % of the cases.
-    """
-
-    theta: Array
-    interval: Array
-    differs: tuple[str, ...] = ()
+# Fit of the selected model to the held-out recordings, which took no part in the selection, so that
+# its intervals do not depend on how the terms were chosen: (p,) estimate and (p, 2) 95 % intervals
+# [theta-unit], and names of the common parameters that differ from those of the fitted recordings
+# by more than both intervals explain; one by chance in 5 % of the cases.
+HeldOutRefit = tuple[Array, Array, tuple[str, ...]]
 
 
 @record
@@ -443,9 +432,13 @@ class Selection(Record):
         "held",
         "hold",
         "segments",
-        "refit",
     )
-    json_names = {"refit": "held_out_refit"}
+
+    def summary(self) -> dict[str, Any]:
+        """The contents of the record in JSON."""
+        keys = ("theta", "interval", "differs")
+        refit = None if self.refit is None else dict(zip(keys, self.refit, strict=True))
+        return {**super().summary(), "held_out_refit": refit}
 
     @property
     def is_changed(self) -> bool:

@@ -46,7 +46,7 @@ from mjfim.parallel.budget import StopToken, stop_on_interrupt
 from mjfim.records.design import Design, Status
 from mjfim.records.estimate import Estimate
 from mjfim.records.events import Callback, StudyEvent, shown_progress
-from mjfim.records.studies import Campaign, CampaignStatus, EarlierRound, Round
+from mjfim.records.studies import Campaign, CampaignStatus, RecordedRound, Round
 from mjfim.records.trajectory import Recording
 
 # Smallest distance of guesses from bounds, relative to the size of a parameter.
@@ -192,7 +192,7 @@ def run_campaign(
     rounds: int = 10,
     callback: Callback | None = None,
     threads: int | None = None,
-    done: Sequence[EarlierRound] = (),
+    done: Sequence[RecordedRound] = (),
     executor: ExecutorLike | None = None,
     stop: StopToken | None = None,
     progress: bool = True,
@@ -211,7 +211,8 @@ def run_campaign(
         callback: Called with the events of every design and estimation, and with a `StudyEvent`
             after every round, whose `result` is the `Round`.
         threads: Threads of MuJoCo; None for all cores.
-        done: Rounds that are recorded already; their designs are not made again.
+        done: Design and recordings of each round that is recorded already, which is not designed
+            again; None in place of the design for recordings that were made without one.
         executor: Where the work is done (`mjfim.ExecutorLike`); None for this process. It
             divides every design and every estimate.
         stop: Ends the campaign early, as Ctrl-C does, after the last complete round.
@@ -272,7 +273,7 @@ class _CampaignRun:
     rounds: list[Round] = field(default_factory=list)
     pending: Design | None = None
 
-    def run(self, measure: Measure, done: Sequence[EarlierRound]) -> CampaignStatus:
+    def run(self, measure: Measure, done: Sequence[RecordedRound]) -> CampaignStatus:
         """Make all rounds.
 
         Args:
@@ -282,8 +283,8 @@ class _CampaignRun:
         Returns:
             The reason for which the campaign ended.
         """
-        for earlier in done:
-            if not self._add_round(earlier):
+        for design, recordings in done:
+            if not self._add_round(design, recordings):
                 return CampaignStatus.INTERRUPTED
 
         while not self._targets_reached() and len(self.rounds) < self.count:
@@ -320,14 +321,7 @@ class _CampaignRun:
         if not recordings:
             return CampaignStatus.WAITING
 
-        recorded = EarlierRound(
-            recordings=recordings,
-            theta=design.theta,
-            predicted=design.final.std,
-            control=design.trajectory.ctrl,
-            design=design,
-        )
-        if not self._add_round(recorded, remarks):
+        if not self._add_round(design, recordings, remarks):
             return CampaignStatus.INTERRUPTED
         self.pending = None
         return None
@@ -389,24 +383,30 @@ class _CampaignRun:
         budget = design_budget(task, self.stop)
         return design_task(task, callback=self.callback, budget=budget, **further)
 
-    def _add_round(self, recorded: EarlierRound, remarks: Sequence[str] = ()) -> bool:
+    def _add_round(
+        self,
+        design: Design | None,
+        recordings: tuple[Recording, ...],
+        remarks: Sequence[str] = (),
+    ) -> bool:
         """Identify from all recordings and keep the round.
 
         Args:
-            recorded: Recordings of the round, and what is known about their design.
+            design: The design of the round; None for recordings that were made without one.
+            recordings: Its recordings.
             remarks: Remarks about the design.
 
         Returns:
             False where the identification was interrupted.
         """
-        p, design = self.base.parameters, recorded.design
-        theta = p.guess if recorded.theta is None else recorded.theta
+        p = self.base.parameters
+        theta = p.guess if design is None else design.theta
         start = self.rounds[-1].estimate.theta if self.rounds else theta
 
         earlier = [recording for r in self.rounds for recording in r.recordings]
         estimate = identify_all(
             self.base,
-            [*earlier, *recorded.recordings],
+            [*earlier, *recordings],
             start,
             callback=self.callback,
             stop=self.stop,
@@ -421,14 +421,12 @@ class _CampaignRun:
         warnings += estimate.warnings
         warnings += self._suspicions(estimate)
 
-        unknown = np.full(len(p), np.nan)
-        control = recorded.control
         current = Round(
             number=len(self.rounds) + 1,
             theta=theta,
-            predicted=unknown if recorded.predicted is None else recorded.predicted,
-            control=recorded.recordings[0].ctrl if control is None else control,
-            recordings=recorded.recordings,
+            predicted=np.full(len(p), np.nan) if design is None else design.final.std,
+            control=recordings[0].ctrl if design is None else design.trajectory.ctrl,
+            recordings=recordings,
             estimate=estimate,
             design=design,
             warnings=tuple(warnings),

@@ -206,8 +206,9 @@ def _clearance(source: ModelSource, positions: Array, least: float) -> dict[str,
     if len(near) == len(nearest):
         return {}
     names = np.array(unique_names(model, "body"))[model.geom_bodyid]
-    ignored = {(names[p.first], names[p.second]): None for p in pairs if p.bodies in near}
-    return stated | ({"ignored": [[str(end) for end in each] for each in ignored]} if near else {})
+    ends = dict.fromkeys((str(names[first]), str(names[second])) for first, second, _ in pairs)
+    ignored = [[*each] for each in ends if " - ".join(each) in near]
+    return stated | ({"ignored": ignored} if near else {})
 
 
 def _collides_with_planes(model: Any) -> bool:
@@ -215,5 +216,9 @@ def _collides_with_planes(model: Any) -> bool:
     moving = set(model.geom_bodyid[model.body_weldid[model.geom_bodyid] > 0].tolist())
     with suppress(ExperimentError):
         pairs = find_geom_pairs(model, ())
-        moving -= {model.geom_bodyid[p.first] for p in pairs if model.geom_type[p.second] == PLANE}
+        moving -= {
+            model.geom_bodyid[first]
+            for first, second, _ in pairs
+            if model.geom_type[second] == PLANE
+        }
     return not moving

@@ -85,11 +85,11 @@ def _parameters(source: ModelSource) -> Iterator[ListedParameter]:
     """Paths of all numbers that a parameter can set."""
     model = source.model
     for path, value in paths_of(model, source.decoration):
-        yield ListedParameter(path=path, value=value, unit=unit_of(model, path))
+        yield path, value, unit_of(model, path)
 
     for component in source.coordinates.deviations:
         if component.path:
-            yield ListedParameter(path=component.path, value=0.0, unit=component.unit)
+            yield component.path, 0.0, component.unit
 
 
 def _outputs(source: ModelSource) -> Iterator[ListedOutput]:
@@ -118,7 +118,7 @@ def _actuators(source: ModelSource) -> Iterator[ListedActuator]:
     for control, i in zip(source.coordinates.controls, numbers, strict=True):
         kind = TRANSMISSIONS.get(mujoco.mjtTrn(model.actuator_trntype[i]), "")
         drives = f"{kind} {names[kind][model.actuator_trnid[i, 0]]}" if kind else ""
-        yield ListedActuator(name=control, drives=drives, unit=control_unit(model, i))
+        yield control, drives, control_unit(model, i)
 
 
 def _listed(limit: Limit) -> LimitRange:

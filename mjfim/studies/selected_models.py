@@ -226,8 +226,8 @@ def with_selection(
 
     # Held-out recordings took no part in the choice, so that what they contradict is not known.
     if selection.refit is not None:
-        differs = np.isin(estimate.parameters, selection.refit.differs)
-        other = selection.refit.interval
+        _, other, names = selection.refit
+        differs = np.isin(estimate.parameters, names)
         low = np.where(differs, np.minimum(low, other[:, 0]), low)
         high = np.where(differs, np.maximum(high, other[:, 1]), high)
     interval = np.column_stack([low, high])

@@ -226,11 +226,8 @@ class _Selector:
         except SimulationDivergedError:
             return None
         interval = found.accuracy.interval
-        return HeldOutRefit(
-            theta=found.theta,
-            interval=interval,
-            differs=different(estimate, found.theta, interval, result.task.system.parameters),
-        )
+        differs = different(estimate, found.theta, interval, result.task.system.parameters)
+        return found.theta, interval, differs
 
     def _final(self, result: FitResult, is_free: bool, *, is_changed: bool) -> FitResult:
         """The fit of the chosen model, with all attempts against local minima."""

@@ -13,7 +13,7 @@ from rich.progress import Progress
 from mjfim.cli import progress as module
 from mjfim.cli.progress import ProgressDisplay, clock, progress, say
 from mjfim.excitation.task import DesignTask
-from mjfim.output.progress_text import design_stage, design_text
+from mjfim.output.live import design_stage, design_text
 from mjfim.records.design import HistoryRow
 from mjfim.records.events import DesignEvent, StudyEvent, begin_stage, stages_observed_by
 from mjfim.studies.check import check_task

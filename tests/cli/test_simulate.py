@@ -20,7 +20,7 @@ def test_simulate_leaves_a_recording_that_the_seed_determines(folder: Path) -> N
     task = DesignTask.resolve(mjfim.Experiment.from_file("study.toml"))
     first = Path("run.csv").read_bytes()
     recording = logs.read_recording(Path("run.csv"), task.system.channels)
-    curve = archive.read_design(folder / "out" / "design.npz")["final"]
+    curve = archive.read_design(folder / "out" / "design.npz", task.system)["final"]
     assert np.array_equal(recording.ctrl, curve.ctrl)
     noise = recording.y - np.hstack([curve.qpos, curve.qvel])
     assert noise.std() == pytest.approx(0.05, rel=0.15)

@@ -126,7 +126,7 @@ def test_criterion_c_refuses_what_cannot_be_identified(tmp_path) -> None:
         design_task(pendulum(tmp_path, cost={"criterion": "c", "subset": ["m2"]}))
     visible = {"criterion": "c", "combination": {"I1": 1.0, "m2": 0.09}}
     design = design_task(pendulum(tmp_path, cost=visible))
-    (known,) = (c.std_final for c in design.combined if c.expression.startswith("I1 "))
+    (known,) = (c.std for c in design.combined if c.name.startswith("I1 "))
     assert design.final.criterion == pytest.approx(known**2 * 100.0, rel=1e-6)  # per second, 100 Hz
 
 

@@ -160,8 +160,8 @@ def test_a_film_shows_both_robots_as_ghosts_whose_differences_are_magnified(
     factor = float(film.note.rpartition(" ")[2].rstrip("."))
     assert film.caption.startswith("The initial motion beside the designed motion, in real time.")
     assert film.note.startswith("Pale: two robots alike in the initial motion")
-    for view, (_, plan) in zip(film.views, motions(design), strict=True):
-        (_, model), *ghosts = view.tracks
+    for tracks, (_, plan) in zip(film.tracks, motions(design), strict=True):
+        (_, model), *ghosts = tracks
         assert len(ghosts) == 2
         # Every frame of a film of 25 Hz is a sample of a motion of 100 Hz.
         for (_, ghost), theta in zip(ghosts, valley.theta, strict=True):

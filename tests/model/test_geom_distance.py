@@ -98,8 +98,8 @@ def asked(model: mujoco.MjModel, chosen: GeomDistances, qpos: Array, limit: floa
         data.qpos[:] = now
         mujoco.mj_kinematics(model, data)
         out[k] = [
-            mujoco.mj_geomDistance(model, data, p.first, p.second, limit, None)
-            for p in chosen.pairs
+            mujoco.mj_geomDistance(model, data, first, second, limit, None)
+            for first, second, _ in chosen.pairs
         ]
     return out
 
@@ -168,9 +168,9 @@ def test_pairs_agree_with_mujocos_collisions(flag: str) -> None:
     mujoco.mj_fwdPosition(model, data)
     contacts = {frozenset(map(int, geoms)) for geoms in data.contact.geom}
     found = find_geom_pairs(model, ())
-    assert {frozenset((p.first, p.second)) for p in found} == contacts
+    assert {frozenset(geoms) for *geoms, _ in found} == contacts
     assert len(found) == len(contacts)
-    names = {p.name for p in found}
+    names = {name for _, _, name in found}
     assert {"one - base", "one - floor", "three - tip", "ball_two - cart"} <= names
     assert {n for n in names if "seen" in n} == {"one_seen - cart"}  # by its explicit pair
     assert ("plate - two" in names) == ("disable" in flag)
@@ -179,10 +179,10 @@ def test_pairs_agree_with_mujocos_collisions(flag: str) -> None:
 def test_ignored_bodies_are_left_out() -> None:
     """All pairs of geoms of the two bodies are ignored, in either order, also with the world."""
     model = mujoco.MjModel.from_xml_string(ARMS)
-    every = {p.name for p in find_geom_pairs(model, ())}
+    every = {name for _, _, name in find_geom_pairs(model, ())}
     left = {
-        p.name
-        for p in find_geom_pairs(
+        name
+        for _, _, name in find_geom_pairs(
             model, {frozenset(("world", "wrist")), frozenset(("wrist", "hand"))}
         )
     }
@@ -228,7 +228,7 @@ def test_all_distances_within_reach_are_found(reach: float) -> None:
     chosen, qpos = between(model, reach), scattered(model, 200, 0.4)
     model.opt.ccd_tolerance, model.opt.ccd_iterations = 1e-10, 200
     d, expected = chosen(qpos, False)[0], asked(model, chosen, qpos, reach)
-    shapes = [{int(model.geom_type[g]) for g in (p.first, p.second)} for p in chosen.pairs]
+    shapes = [{int(model.geom_type[g]) for g in geoms} for *geoms, _ in chosen.pairs]
     trusted = (d > -0.05) | np.array([s != {CAPSULE, BOX} for s in shapes])  # see below
     assert trusted.mean() > 0.99
     assert_allclose(d[trusted], expected[trusted], rtol=0, atol=1e-8)
@@ -331,8 +331,8 @@ def test_columns_are_pairs_of_bodies() -> None:
     (bodies, by_bodies), (geoms, by_geoms) = chosen(qpos, True), single(qpos, True)
     names = np.array(
         [
-            " - ".join(model.body(model.geom_bodyid[g]).name for g in (p.first, p.second))
-            for p in single.pairs
+            " - ".join(model.body(model.geom_bodyid[g]).name for g in geoms)
+            for *geoms, _ in single.pairs
         ]
     )
     assert sorted(chosen.columns) == sorted({*names})
@@ -347,7 +347,7 @@ def test_columns_are_pairs_of_bodies() -> None:
 def test_nearest_is_the_smallest_of_all(spread: float) -> None:
     """The distance may be larger than the reach; its row and its geoms are found as well."""
     model = mujoco.MjModel.from_xml_string(ARMS)
-    stone = [p for p in find_geom_pairs(model, ()) if "stone" in p.name and "floor" not in p.name]
+    stone = [p for p in find_geom_pairs(model, ()) if "stone" in p[2] and "floor" not in p[2]]
     chosen, qpos = GeomDistances(model, stone, 0.01), scattered(model, 40, spread)
     if spread > 1.0:
         qpos = qpos[(chosen(qpos, False)[0] == 0.01).all(axis=1)]
@@ -356,7 +356,7 @@ def test_nearest_is_the_smallest_of_all(spread: float) -> None:
     row, column = np.unravel_index(every.argmin(), every.shape)
     distance, where, pair = chosen.nearest(qpos)
     assert distance == pytest.approx(every.min(), abs=1e-8)
-    assert (where, pair) == (row, chosen.pairs[column])
+    assert (where, pair) == (row, chosen.pairs[column][2])
     assert (distance > 0.01) == (spread > 1.0)
 
 

@@ -74,5 +74,5 @@ def test_a_short_design_improves_and_writes_all_files(
     draw()
     told = read(folder / "design.json")
     assert len(told["final"]["std"]) == len(told["parameters"])
-    assert [c["words"] for c in told["combined"]] == [c.expression for c in design.combined]
+    assert [c["words"] for c in told["combined"]] == [c.name for c in design.combined]
     assert bool(design.combined) == (name in TOGETHER)

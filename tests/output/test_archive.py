@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 from mjfim.errors import RecordingError
 from mjfim.excitation.design import design_task
 from mjfim.excitation.task import DesignTask
-from mjfim.experiment.given import check_fits
 from mjfim.experiment.system import simulate_system
 from mjfim.files import PREFIX, as_json, remove_temporary_files, replacing
 from mjfim.output import archive
@@ -106,16 +105,18 @@ def test_npz_holds_the_documented_arrays(folder: Path, design: Design) -> None:
     assert np.array_equal(psi, design.initial.sensitivity)
 
 
-def test_trajectories_are_read_as_they_were(folder: Path, design: Design, tmp_path: Path) -> None:
+def test_trajectories_are_read_as_they_were(
+    folder: Path, design: Design, task: DesignTask, tmp_path: Path
+) -> None:
     """Every number is read back exactly; the initial trajectory is optional."""
-    named = archive.read_design(folder / "design.npz")
+    named = archive.read_design(folder / "design.npz", task.system)
     stated = {"initial": design.initial.trajectory, "final": design.trajectory}
     assert named.keys() == stated.keys()
     for name, curve in stated.items():
         for key in ("t", "qpos", "qvel", "act", "ctrl"):
             assert np.array_equal(getattr(named[name], key), getattr(curve, key)), (name, key)
     path = altered(folder / "design.npz", tmp_path / "alone.npz", initial_t=None)
-    assert set(archive.read_design(path)) == {"final"}
+    assert set(archive.read_design(path, task.system)) == {"final"}
 
 
 def test_json_holds_the_documented_keys(folder: Path, design: Design) -> None:
@@ -171,9 +172,11 @@ def altered(source: Path, path: Path, **arrays: Any) -> Path:
     ("name", "said"),
     [("gone.npz", "no such design file"), ("", "this is a folder; name the design file")],
 )
-def test_a_missing_file_and_a_folder_are_named(name: str, said: str, tmp_path: Path) -> None:
+def test_a_missing_file_and_a_folder_are_named(
+    name: str, said: str, task: DesignTask, tmp_path: Path
+) -> None:
     with pytest.raises(RecordingError, match=said):
-        archive.read_design(tmp_path / name)
+        archive.read_design(tmp_path / name, task.system)
 
 
 @pytest.mark.parametrize(
@@ -197,7 +200,7 @@ def test_wrong_arrays_are_refused(
     """Arrays that do not fit are refused before they are simulated or drawn."""
     path = altered(folder / "design.npz", tmp_path / "odd.npz", **{name: array})
     with pytest.raises(RecordingError, match=rf"odd\.npz: .*{said}"):
-        check_fits(path, archive.read_design(path)["final"], task.system)
+        archive.read_design(path, task.system)
 
 
 # ---- whole or not at all

@@ -14,8 +14,8 @@ from matplotlib.figure import Figure
 
 from mjfim.output.plots.draw import figure_of
 from mjfim.output.plots.pictures import pictures_of
-from mjfim.records.base import ShownRecord
-from mjfim.records.design import CombinationAccuracy, Design, LimitUsage
+from mjfim.records.base import ShownRecord, listed_values
+from mjfim.records.design import Design, LimitUsage
 from mjfim.records.estimate import Estimate, Whiteness
 from mjfim.records.rehearsal import Separation, Valley
 from mjfim.records.terms import Decision, Selection, SelectionStep
@@ -58,7 +58,7 @@ def design(joints: int, count: int, width: int) -> Design:
         motion=motion,
         designed=designed,
     )
-    combined = CombinationAccuracy(expression="a + 2 b", value=1.0, std_initial=1.0, std_final=0.5)
+    (combined,) = listed_values(["a + 2 b"], [""], np.ones(1), np.full(1, 0.5), std_initial=[1.0])
     return replace(
         make_design(joints, count),
         parameters=labels.parameters,

@@ -13,8 +13,8 @@ import pytest
 
 import mjfim
 from mjfim.excitation.task import DesignTask
-from mjfim.output import progress_text
-from mjfim.output.progress_text import NotebookProgress
+from mjfim.output import live
+from mjfim.output.live import NotebookProgress
 from mjfim.records import events
 from mjfim.records.events import Event, FitEvent, StudyEvent
 from tests.support.cart_pendulum import cart_pendulum
@@ -42,7 +42,7 @@ def places(monkeypatch: pytest.MonkeyPatch) -> list[Shown]:
 
     monkeypatch.setattr(events, "in_notebook", lambda: True)
     monkeypatch.setattr("IPython.display.display", display)
-    monkeypatch.setattr(progress_text, "UPDATE_SECONDS", 0.0)
+    monkeypatch.setattr(live, "UPDATE_SECONDS", 0.0)
     return found
 
 
@@ -101,7 +101,7 @@ def test_a_callback_replaces_the_bar_and_programs_show_nothing(
 
 
 def test_an_error_is_said_where_the_bar_was(places: list[Shown]) -> None:
-    with pytest.raises(ZeroDivisionError), progress_text.progress("dividing"):
+    with pytest.raises(ZeroDivisionError), live.progress("dividing"):
         _ = 1 / 0
     assert "dividing (ended by an error after 0.0 s)" in places[0][-1]
 
@@ -120,7 +120,7 @@ def test_the_share_of_a_study_is_drawn_and_text_is_escaped(places: list[Shown]) 
 def test_updates_that_come_too_soon_are_left_out(
     places: list[Shown], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(progress_text, "UPDATE_SECONDS", 1e6)
+    monkeypatch.setattr(live, "UPDATE_SECONDS", 1e6)
     show = NotebookProgress("identifying")
     for i in range(100):
         show(FitEvent(phase="all data", iteration=i, cost=1.0, step=1.0))

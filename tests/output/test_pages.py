@@ -20,9 +20,9 @@ from mjfim.output.pages.estimate import selection_parts
 from mjfim.output.rerun.documents import as_markdown
 from mjfim.output.terminal import laid_out
 from mjfim.output.words import improvement, relative
-from mjfim.records.base import Level, ShownRecord, Verdict
+from mjfim.records.base import Level, ShownRecord, Verdict, listed_values
 from mjfim.records.check import findings_of_check
-from mjfim.records.design import CombinationAccuracy, LimitViolation, ScaledStart, Status
+from mjfim.records.design import LimitViolation, ScaledStart, Status
 from mjfim.records.studies import CampaignStatus
 from mjfim.records.terms import (
     AlternativeTerm,
@@ -83,7 +83,7 @@ def test_pages_say_what_was_tested_and_which_parameters_are_nuisance() -> None:
 def test_inseparable_parameters_are_marked() -> None:
     """The combination has a row, and nothing is divided by zero."""
     std = np.array([np.inf, 0.1, 0.1])
-    combined = CombinationAccuracy(expression="m + 2 l", value=0.0, std_initial=0.4, std_final=0.1)
+    (combined,) = listed_values(["m + 2 l"], [""], np.zeros(1), np.full(1, 0.1), std_initial=[0.4])
     start = replace(results.evaluation(0.1, 50), std=std)
     text = printed(
         page_of(

@@ -32,7 +32,8 @@ from mjfim.output.plots.pictures import draw, picture_names, pictures_of, usual
 from mjfim.output.plots.studies import check, histogram
 from mjfim.output.report import report_of
 from mjfim.output.words import relative
-from mjfim.records.design import CombinationAccuracy, LimitUsage
+from mjfim.records.base import listed_values
+from mjfim.records.design import LimitUsage
 from mjfim.records.estimate import Estimate
 from mjfim.records.terms import Decision, Selection, SelectionStep
 from mjfim.records.trajectory import with_unit
@@ -309,7 +310,7 @@ def test_outliers_and_endless_bounds_do_not_widen_a_histogram() -> None:
 
 
 def test_parameters_that_are_not_known_alone_are_arrows_and_without_correlation() -> None:
-    combined = (CombinationAccuracy(expression="a + b", value=1.0, std_initial=1.0, std_final=0.5),)
+    combined = tuple(listed_values(["a + b"], [""], np.ones(1), np.full(1, 0.5)))
     made = results.check()
     rows = tuple(replace(row, std=np.inf, relative=np.inf) for row in made.rows[:2])
     correlation = made.correlation.copy()

@@ -41,9 +41,8 @@ def system() -> System:
 
 def test_every_model_is_the_one_in_memory(system: System, tmp_path: Path) -> None:
     estimate, out = drawn(system, COVARIANCE, 5), tmp_path / "out"
-    assert estimate.draws is not None
     values = estimate.draws.values
-    assert write_samples(out, estimate, system) == []
+    assert write_samples(out, estimate.draws, estimate.theta, system) == []
     found = {path.relative_to(out).as_posix() for path in out.rglob("*.*")}
     assert found == {*sample_files(out)}
 
@@ -77,14 +76,15 @@ def test_all_models_are_written_or_none(
 
     monkeypatch.setattr(folders, "write_identified", fail)
     with claimed(tmp_path, OutputGuard([], force=False), exclusive=True):
-        (remark,) = write_samples(tmp_path, estimate, system)
+        (remark,) = write_samples(tmp_path, estimate.draws, estimate.theta, system)
     assert remark == "no models of drawn robots were written: the link has a fault"
     assert {path.name for path in tmp_path.iterdir()} == {"samples.csv", MANIFEST}
 
 
 def test_files_of_the_user_remain(system: System, tmp_path: Path) -> None:
+    estimate = drawn(system, COVARIANCE, 3)
     with claimed(tmp_path, OutputGuard([], force=False), exclusive=True):
-        write_samples(tmp_path, drawn(system, COVARIANCE, 3), system)
+        write_samples(tmp_path, estimate.draws, estimate.theta, system)
     (tmp_path / "samples" / "robot_0002.xml").write_text("edited", encoding="utf-8")
     (tmp_path / "samples" / "notes.txt").write_text("mine", encoding="utf-8")
     with claimed(tmp_path, OutputGuard([], force=False), exclusive=True):

@@ -95,7 +95,7 @@ class TestFilm:
         assert beside.caption == "The initial motion beside the designed motion, in real time."
 
         behind = identified(swing, four, higher)
-        assert behind.views[0].named == {"identified": False, "measured": True}
+        assert behind.named == [{"identified": False, "measured": True}]
         words = "The identified motion and the measured motion (transparent)"
         assert behind.caption.startswith(words)
 
@@ -117,17 +117,16 @@ class TestFilm:
         margins[3] = -0.1
         designed = replace(results.evaluation(0.1, 50), trajectory=motion(t, moves[0]))
         design = results.design(initial=designed, final=designed, rehearsal=safe)
-        left, right = film_of(
-            system, replace(design, rehearsal=replace(safe, margins=margins))
-        ).views
-        assert [term for term, _ in left.tracks] == ["initial"]
-        assert right.named == {"designed": False, "unsafe": True, "rehearsed": True}
-        for (_, drawn), qpos in zip(right.tracks, moves[[0, 1, 3]], strict=True):
+        film = film_of(system, replace(design, rehearsal=replace(safe, margins=margins)))
+        left, right = film.tracks
+        assert [term for term, _ in left] == ["initial"]
+        assert film.named[1] == {"designed": False, "unsafe": True, "rehearsed": True}
+        for (_, drawn), qpos in zip(right, moves[[0, 1, 3]], strict=True):
             assert_allclose(drawn, qpos, atol=1e-12)
 
         # Two safe robots are named once.
         film = film_of(system, design)
-        assert len(film.views[1].tracks) == 3 and film.caption.count("rehearsed") == 1
+        assert len(film.tracks[1]) == 3 and film.caption.count("rehearsed") == 1
 
     def test_positions_between_samples_turn_the_shortest_way(self, flying: mujoco.MjModel) -> None:
         begin, middle, end = (
@@ -152,9 +151,9 @@ class TestFilm:
         qpos = np.tile(model.qpos0, (41, 1))
         qpos[:, 0] = scale * distance * t / 4.0
 
-        (view,) = identified(model, motion(t, qpos)).views
-        assert len(view.trail) == (100 if follows else 0)
-        travelled = view.target[-1, 0] - view.target[0, 0]
+        film = identified(model, motion(t, qpos))
+        assert [len(trail) for trail in film.trails] == [100 if follows else 0]
+        travelled = film.targets[0, -1, 0] - film.targets[0, 0, 0]
         assert travelled == pytest.approx(scale * distance if follows else 0.0, rel=0.1)
 
     @pytest.mark.parametrize(("axis", "size"), [("0 0 1", (640, 360)), ("0 1 0", (480, 480))])
@@ -165,7 +164,7 @@ class TestFilm:
         text = SWING.replace("0 1 0", axis).replace("0 0 -1", "0.8 0 -0.1")
         t = np.linspace(0.0, 4.0, 81)
         turning = motion(t, 0.5 * np.pi * t[:, None])
-        assert identified(mujoco.MjModel.from_xml_string(text), turning).camera.size == size
+        assert identified(mujoco.MjModel.from_xml_string(text), turning).size == size
 
 
 class TestVideo:

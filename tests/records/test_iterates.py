@@ -11,8 +11,8 @@ from mjfim.records.design import (
     MAX_MOTIONS,
     MOTION_SAMPLES,
     HistoryRow,
-    IterateMotion,
     extended,
+    iterate_motion,
     without_motions,
 )
 from mjfim.records.trajectory import Trajectory
@@ -27,27 +27,28 @@ def moved(samples: int) -> Trajectory:
 
 
 def test_a_motion_has_both_ends_and_evenly_spread_samples() -> None:
-    motion = IterateMotion.of(moved(1000))
+    motion = iterate_motion(moved(1000))
     assert motion is not None
-    assert motion.t.shape == (MOTION_SAMPLES,) and motion.qpos.shape == (MOTION_SAMPLES, 1)
-    assert motion.t[0] == 0.0 and motion.t[-1] == 10.0
-    assert np.ptp(np.diff(motion.t)) < 0.011
-    assert_array_equal(motion.qpos[:, 0], motion.t)
-    assert_array_equal(motion.ctrl[:-1, 0], motion.t[:-1])
+    t, qpos, ctrl = motion
+    assert t.shape == (MOTION_SAMPLES,) and qpos.shape == (MOTION_SAMPLES, 1)
+    assert t[0] == 0.0 and t[-1] == 10.0
+    assert np.ptp(np.diff(t)) < 0.011
+    assert_array_equal(qpos[:, 0], t)
+    assert_array_equal(ctrl[:-1, 0], t[:-1])
 
 
 def test_short_and_diverged_iterates_are_taken() -> None:
-    short = IterateMotion.of(moved(3))
+    short = iterate_motion(moved(3))
     assert short is not None
-    assert set(short.t.tolist()) == {*moved(3).t.astype(np.float32).tolist()}
-    assert IterateMotion.of(None) is None
+    assert set(short[0].tolist()) == {*moved(3).t.astype(np.float32).tolist()}
+    assert iterate_motion(None) is None
     diverged = replace(moved(3), qpos=np.full((4, 1), np.inf))
-    assert IterateMotion.of(diverged) is None
+    assert iterate_motion(diverged) is None
 
 
 def test_many_iterates_keep_few_motions_evenly_spread() -> None:
     history: tuple[HistoryRow, ...] = ()
-    motion = IterateMotion.of(moved(5))
+    motion = iterate_motion(moved(5))
     for iteration in range(500):
         history = extended(history, [make_row(iteration=iteration, motion=motion)])
     kept = [entry.iteration for entry in history if entry.motion is not None]
@@ -57,7 +58,7 @@ def test_many_iterates_keep_few_motions_evenly_spread() -> None:
 
 
 def test_motions_are_separated_from_the_history() -> None:
-    by_iteration = {0: None, 1: IterateMotion.of(moved(9)), 4: IterateMotion.of(moved(5))}
+    by_iteration = {0: None, 1: iterate_motion(moved(9)), 4: iterate_motion(moved(5))}
     rows = [make_row(iteration=i, motion=motion) for i, motion in by_iteration.items()]
     history, motions = without_motions(rows)
     assert all(entry.motion is None for entry in history)

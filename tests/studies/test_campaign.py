@@ -32,7 +32,7 @@ from mjfim.output.campaign_folder import (
 from mjfim.output.manifest import MANIFEST
 from mjfim.parallel.budget import StopToken
 from mjfim.records.design import Design, Status
-from mjfim.records.studies import Campaign, CampaignStatus, EarlierRound
+from mjfim.records.studies import Campaign, CampaignStatus, RecordedRound
 from mjfim.records.trajectory import Recording
 from mjfim.studies import campaign as campaign_module
 from mjfim.studies.campaign import restate_experiment
@@ -168,20 +168,15 @@ def test_a_redesign_expects_the_noise_that_the_recordings_show() -> None:
     assert_allclose(np.diag(last.design.data), np.diag(told), rtol=0.3)
 
 
-def earlier(campaign: Campaign) -> EarlierRound:
+def earlier(campaign: Campaign) -> RecordedRound:
     """The first round, as another call reads it from its folder."""
     first = campaign.rounds[0]
-    return EarlierRound(
-        recordings=first.recordings,
-        theta=first.theta,
-        predicted=first.predicted,
-        control=first.control,
-    )
+    return first.design, first.recordings
 
 
 def after_two(campaign: Campaign, second: Recording) -> Campaign:
     """The campaign after its first round and a second one with this recording."""
-    done = [earlier(campaign), EarlierRound(recordings=(second,))]
+    done = [earlier(campaign), (None, (second,))]
     return mjfim.run_campaign(STUDY.replace(fit={"bootstrap": 0}), NEVER, rounds=2, done=done)
 
 

@@ -36,15 +36,15 @@ ODD = """
 
 def test_every_listed_path_can_be_a_target_and_has_the_value_of_the_model() -> None:
     inventory = list_model(MODELS / "servo_arm.xml")
-    values = {each.path: each for each in inventory.parameters}
-    assert values["joint/yaw:damping"].unit == "N m s/rad"
+    values = {path: (value, unit) for path, value, unit in inventory.parameters}
+    assert values["joint/yaw:damping"][1] == "N m s/rad"
     model = mujoco.MjModel.from_xml_path(str(MODELS / "servo_arm.xml"))
-    assert values["actuator/shoulder:kp"].value == model.actuator("shoulder").gainprm[0]
+    assert values["actuator/shoulder:kp"][0] == model.actuator("shoulder").gainprm[0]
     assert not any(path.startswith("body/world") for path in values)
 
     # A sample of all paths, because each experiment takes a moment.
-    for entry in inventory.parameters[::40]:
-        spec = {"target": entry.path, "guess": entry.value if entry.value is not None else 1.0}
+    for path, value, unit in inventory.parameters[::40]:
+        spec = {"target": path, "guess": value if value is not None else 1.0}
         experiment = Experiment(
             model="servo_arm.xml",
             rate=100.0,
@@ -53,12 +53,12 @@ def test_every_listed_path_can_be_a_target_and_has_the_value_of_the_model() -> N
             directory=MODELS,
         )
         parameter = System.resolve(experiment).parameters.parameters[0]
-        assert parameter.unit == entry.unit
+        assert parameter.unit == unit
 
 
 def test_outputs_actuators_keyframes_and_limits_are_listed() -> None:
     inventory = list_model(MODELS / "quadrotor.xml")
-    assert {each.name for each in inventory.actuators} == {"fl", "fr", "rl", "rr"}
+    assert {name for name, _, _ in inventory.actuators} == {"fl", "fr", "rl", "rr"}
     assert [each.name for each in inventory.keyframes] == ["hover"]
     assert {(each.kind, each.lower, each.upper) for each in inventory.limits} == {
         ("control", 0.0, 1.0)
@@ -84,7 +84,7 @@ def test_elements_without_a_name_and_ranges_that_are_not_kept_are_said(tmp_path:
 def test_selections_keep_what_is_wanted() -> None:
     inventory = list_model(MODELS / "cart_pendulum.xml")
     selected = inventory.selected(lambda name: "damping" in name)
-    paths = [each.path for each in selected.parameters]
+    paths = [path for path, _, _ in selected.parameters]
     assert sorted(paths) == ["joint/hinge:damping", "joint/slide:damping"]
     assert selected.count == 2
     for kind in KINDS:

@@ -9,11 +9,11 @@ import pytest
 from mjfim.records.design import (
     Design,
     Evaluation,
-    IterateMotion,
     IterateMotions,
     LimitUsage,
     StartResult,
     Status,
+    iterate_motion,
 )
 from mjfim.records.estimate import Estimate
 from mjfim.records.trajectory import Recording, Trajectory
@@ -117,7 +117,7 @@ def designed(model: mujoco.MjModel) -> Design:
         for k in range(3)
     )
     initial, final = simulated(model, 0.5), simulated(model, 2.0)
-    iterates = [(k, IterateMotion.of(simulated(model, 0.5 + 0.75 * k))) for k in range(3)]
+    iterates = [(k, iterate_motion(simulated(model, 0.5 + 0.75 * k))) for k in range(3)]
     return Design(
         motions=IterateMotions.of([(k, motion) for k, motion in iterates if motion]),
         usage=(

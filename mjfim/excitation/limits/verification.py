@@ -295,7 +295,7 @@ def _clearance_usage(
 
     t = _engine_times(task, len(positions))
     share = clearance.least / np.maximum(nearest, CONTACT_SHARE * clearance.least)
-    used = LimitUsage(kind="clearance", name=pair.name, t=t, share=share, lower=clearance.least)
+    used = LimitUsage(kind="clearance", name=pair, t=t, share=share, lower=clearance.least)
     return distance, used
 
 
@@ -351,7 +351,7 @@ def _require_inside(task: DesignTask, constraints: ConstraintSet, where: str, st
     if distance < clearance.least:
         fault = "in collision" if distance < 0.0 else "too close"
         raise ExperimentError(
-            f"limits.clearance: {where} is {fault}: {pair.name} are {distance:.3g} m apart, but "
+            f"limits.clearance: {where} is {fault}: {pair} are {distance:.3g} m apart, but "
             f"have to be {clearance.least:g} m apart; move {where}, lower the clearance, or list "
             "the pair's bodies in limits.ignored"
         )

@@ -32,10 +32,10 @@ from mjfim.parallel.budget import Budget, StopReason, StopToken
 from mjfim.parallel.shared_value import KeptPerThread, SharedValue
 from mjfim.records.design import (
     HistoryRow,
-    IterateMotion,
     StartResult,
     Status,
     extended,
+    iterate_motion,
 )
 from mjfim.records.events import DesignEvent
 
@@ -617,5 +617,5 @@ def row_of(
         mu=mu,
         margin=min(margins.values(), default=np.nan),
         margins=dict(margins),
-        motion=IterateMotion.of(None if point is None else point.trajectory),
+        motion=iterate_motion(None if point is None else point.trajectory),
     )

@@ -28,7 +28,7 @@ from mjfim.model.elements import (
 from mjfim.model.terms.term import (
     NEGLIGIBLE,
     NON_NEGATIVE,
-    FieldDescription,
+    Field,
     JointSizes,
     Shape,
     Term,
@@ -114,7 +114,7 @@ class ActuatorLag(Term):
     equation = "force = gain · a + bias, ȧ = (control - a)/time_constant"
     elements = "dyntype filterexact and actearly of the actuator; with RK4 dyntype filter"
     acts_on = "actuator"
-    fields = (FieldDescription("time_constant", "time constant of the lag", "s"),)
+    fields = (("time_constant", "time constant of the lag", "s"),)
     sources = (KRAUSE_2013,)
     words = "a lag of {}"
     size = "time_constant"
@@ -177,7 +177,7 @@ class BackEmf(Term):
     equation = "force = gain · (control - constant · actuator velocity)"
     elements = "biastype affine of the actuator, biasprm[2] = -gain · constant"
     acts_on = "actuator"
-    fields = (FieldDescription("constant", "back-EMF constant K [control · s/rad]", "V s/rad"),)
+    fields = (("constant", "back-EMF constant K [control · s/rad]", "V s/rad"),)
     sources = (KRAUSE_2013, MUJOCO_DCMOTOR)
     # The damping depends on the gain, which may be a parameter as well.
     is_written_as_a_whole = True
@@ -271,9 +271,9 @@ class JointElasticity(Term):
         "a child body and a fixed tendon with armature, on which the motors act"
     )
     acts_on = "joint"
-    fields: ClassVar[tuple[FieldDescription, ...]] = (
-        FieldDescription("compliance", "deflection per torque, 1/K", "rad/(N m)"),
-        FieldDescription("damping", "damping of the deflection", "N m s/rad"),
+    fields: ClassVar[tuple[Field, ...]] = (
+        ("compliance", "deflection per torque, 1/K", "rad/(N m)"),
+        ("damping", "damping of the deflection", "N m s/rad"),
     )
     sources = (SPONG_1987,)
     words = "elasticity of {}"
@@ -416,9 +416,9 @@ class Backlash(JointElasticity):
     )
     acts_on = "joint"
     fields = (
-        FieldDescription("gap", "width of the gap", "rad"),
-        FieldDescription("compliance", "deflection of the flanks per torque", "rad/(N m)"),
-        FieldDescription("damping", "damping between motor and link", "N m s/rad"),
+        ("gap", "width of the gap", "rad"),
+        ("compliance", "deflection of the flanks per torque", "rad/(N m)"),
+        ("damping", "damping between motor and link", "N m s/rad"),
     )
     sources = (NORDIN_2002,)
     words = "backlash of {}"

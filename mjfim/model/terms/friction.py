@@ -31,7 +31,6 @@ from mjfim.errors import ExperimentError
 from mjfim.model.elements import element_name, is_rk4, model_length
 from mjfim.model.terms.term import (
     NON_NEGATIVE,
-    FieldDescription,
     JointSizes,
     Shape,
     Term,
@@ -202,23 +201,24 @@ class _PassiveDevice(Term):
 
     def edit(self, spec: Any) -> None:
         """Add the passive device, and take the dry friction from the joint where it replaces it."""
-        actuator = spec.add_actuator(name=self.name)
-        actuator.trntype = mujoco.mjtTrn.mjTRN_JOINT
-        actuator.target = self.joint
-        actuator.gear = np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0])
-        actuator.dyntype = mujoco.mjtDyn.mjDYN_DCMOTOR
-        actuator.gaintype = mujoco.mjtGain.mjGAIN_DCMOTOR
-        actuator.biastype = mujoco.mjtBias.mjBIAS_DCMOTOR
-        actuator.ctrlspec = mujoco.mjtCtrlInput.mjINPUT_NONE
-
+        actuator = spec.add_actuator(
+            name=self.name,
+            trntype=mujoco.mjtTrn.mjTRN_JOINT,
+            target=self.joint,
+            gear=[1.0, 0.0, 0.0, 0.0, 0.0, 0.0],
+            dyntype=mujoco.mjtDyn.mjDYN_DCMOTOR,
+            gaintype=mujoco.mjtGain.mjGAIN_DCMOTOR,
+            biastype=mujoco.mjtBias.mjBIAS_DCMOTOR,
+            ctrlspec=mujoco.mjtCtrlInput.mjINPUT_NONE,
+            actlimited=mujoco.mjtLimited.mjLIMITED_FALSE,
+            actearly=True,
+        )
         # The motor constant is zero, so that the resistance has no effect.
         numbers = {"gainprm": {0: 1.0}, **self._numbers(self.values)}
         for array, stated in numbers.items():
             values = np.zeros(len(getattr(actuator, array)))
             values[list(stated)] = list(stated.values())
             setattr(actuator, array, values)
-        actuator.actlimited = mujoco.mjtLimited.mjLIMITED_FALSE
-        actuator.actearly = True
         if numbers["dynprm"]:
             actuator.actdim = 1
         if "damping" in self.places:
@@ -240,8 +240,8 @@ class Stribeck(_PassiveDevice):
     elements = 'actuator/dcmotor with input="none" and lugre, beside the joint\'s frictionloss'
     acts_on = "joint"
     fields = (
-        FieldDescription("excess", "static friction minus Coulomb friction", "N m"),
-        FieldDescription("speed", "Stribeck speed", "rad/s"),
+        ("excess", "static friction minus Coulomb friction", "N m"),
+        ("speed", "Stribeck speed", "rad/s"),
     )
     sources = (DE_WIT_1995, ARMSTRONG_1994)
     places: ClassVar[Places] = {"excess": ("biasprm[4]",), "speed": ("biasprm[5]",)}
@@ -280,11 +280,11 @@ class LuGre(_PassiveDevice):
     elements = 'actuator/dcmotor with input="none" and lugre'
     acts_on = "joint"
     fields = (
-        FieldDescription("coulomb", "Coulomb friction", "N m"),
-        FieldDescription("excess", "static friction minus Coulomb friction", "N m"),
-        FieldDescription("speed", "Stribeck speed", "rad/s"),
-        FieldDescription("stiffness", "stiffness of the bristle", "N m/rad"),
-        FieldDescription("damping", "damping of the bristle", "N m s/rad"),
+        ("coulomb", "Coulomb friction", "N m"),
+        ("excess", "static friction minus Coulomb friction", "N m"),
+        ("speed", "Stribeck speed", "rad/s"),
+        ("stiffness", "stiffness of the bristle", "N m/rad"),
+        ("damping", "damping of the bristle", "N m s/rad"),
     )
     sources = (DE_WIT_1995, OLSSON_1998)
     is_written_as_a_whole = True
@@ -337,13 +337,7 @@ class AsymmetricFriction(_PassiveDevice):
     equation = "F = -frictionloss · sgn(v) + offset"
     elements = 'actuator/dcmotor with input="none" and cogging without poles'
     acts_on = "joint"
-    fields = (
-        FieldDescription(
-            "offset",
-            "half of the friction backwards minus that forwards",
-            "N m",
-        ),
-    )
+    fields = (("offset", "half of the friction backwards minus that forwards", "N m"),)
     sources = (ARMSTRONG_1994,)
     places: ClassVar[Places] = {"offset": ("biasprm[0]",)}
     words = "friction of {} that differs by direction"
@@ -400,7 +394,7 @@ class LoadDependentFriction(Term):
         "against two buffers; contact/pair with torsional friction"
     )
     acts_on = "actuator"
-    fields = (FieldDescription("coefficient", "friction per torque of the motor", ""),)
+    fields = (("coefficient", "friction per torque of the motor", ""),)
     sources = (DUCLAUSAUD_2025, GARCIA_2002)
     words = "friction that grows with the torque of {}"
     size = "coefficient"
@@ -489,12 +483,7 @@ class LoadDependentFriction(Term):
         base = spec.worldbody if self.base == WORLD else spec.body(self.base)
         for side, place in zip(SIDES, self.buffers, strict=True):
             self._add_sphere(base, side).pos = place
-            pair = spec.add_pair(name=f"{self.name}_{side}")
-            pair.geomname1, pair.geomname2 = f"{self.name}_ball", f"{self.name}_{side}"
-            pair.condim = 4
-            pair.friction = [0.0, 0.0, self.radius * self.value("coefficient"), 0.0, 0.0]
-            pair.solref = [CONTACT_TIME * spec.option.timestep, 1.0]
-            pair.solimp = IMPEDANCE
+            self._add_contact(spec, side)
 
         tendon = spec.add_tendon(name=self.name)
         tendon.wrap_joint(self.joint, 1.0)
@@ -509,6 +498,18 @@ class LoadDependentFriction(Term):
         geom.group = HIDDEN_GROUP
         geom.rgba = np.zeros(4)
         return geom
+
+    def _add_contact(self, spec: Any, side: str) -> None:
+        """Add the contact of the ball with a buffer, whose torsional friction is the term."""
+        spec.add_pair(
+            name=f"{self.name}_{side}",
+            geomname1=f"{self.name}_ball",
+            geomname2=f"{self.name}_{side}",
+            condim=4,
+            friction=[0.0, 0.0, self.radius * self.value("coefficient"), 0.0, 0.0],
+            solref=[CONTACT_TIME * spec.option.timestep, 1.0],
+            solimp=IMPEDANCE,
+        )
 
 
 def _driven_hinge(model: Any, name: str, actuator: int) -> int:

@@ -19,7 +19,6 @@ from mjfim.model.elements import model_length
 from mjfim.model.terms import drives, friction
 from mjfim.model.terms.term import (
     NON_NEGATIVE,
-    FieldDescription,
     Shape,
     Term,
     TermQuantity,
@@ -41,9 +40,6 @@ PLACES = (1.0, 2.0)
 # that counts; the directions have length 1.
 POSES = 8
 LEAST_TURN = 1e-6
-
-# Name of the body that does not move.
-WORLD = "world"
 
 ATKESON_1986 = (
     "C. G. Atkeson, C. H. An and J. M. Hollerbach, Estimation of inertial parameters of "
@@ -71,9 +67,7 @@ class Tilt(Term):
     equation = "gravity = R(x, y, z) · gravity of the model"
     elements = "option/gravity"
     acts_on = ""
-    fields = tuple(
-        FieldDescription(axis, f"rotation about the world's {axis}", "rad") for axis in AXES
-    )
+    fields = tuple((axis, f"rotation about the world's {axis}", "rad") for axis in AXES)
     sources = (SWEVERS_2007,)
     # All components of gravity depend on all components of the rotation.
     is_written_as_a_whole = True
@@ -130,9 +124,9 @@ class Payload(Term):
     elements = "body without joints, with an inertial"
     acts_on = "body"
     fields = (
-        FieldDescription("mass", "mass of the load", "kg"),
-        *(FieldDescription(axis, f"{axis} in the frame of the body", "m") for axis in AXES),
-        FieldDescription("inertia", "rotational inertia of the load", "kg m²"),
+        ("mass", "mass of the load", "kg"),
+        *((axis, f"{axis} in the frame of the body", "m") for axis in AXES),
+        ("inertia", "rotational inertia of the load", "kg m²"),
     )
     sources = (ATKESON_1986,)
     words = "a payload at {}"
@@ -147,10 +141,11 @@ class Payload(Term):
         """Resolve the term for a body that moves."""
         name, number = named_element(table, "body", model, cls.kind)
         require_free_name(model, "body", table.name)
-        if name == WORLD or model.body_weldid[number] == 0:
+        if model.body_weldid[number] == 0:
             raise ExperimentError(f"body: {name!r} does not move, so that a load has no effect")
 
-        load, length = f"body/{table.name}", model_length(model)
+        load = f"body/{table.name}"
+        length = model_length(model)
         tree_mass = float(model.body_subtreemass[model.body_rootid[number]])
         mass = TermQuantity(
             value=0.0,
@@ -159,22 +154,24 @@ class Payload(Term):
             bounds=NON_NEGATIVE,
             numbers=((f"{load}:mass", 1.0),),
         )
-        inertia = TermQuantity(
-            value=0.0,
+        inertia = replace(
+            mass,
             unit="kg m²",
             size=tree_mass * length**2,
-            bounds=NON_NEGATIVE,
             numbers=tuple((f"{load}:inertia[{i}]", 1.0) for i in range(3)),
         )
-        place = TermQuantity(value=0.0, unit="m", size=length)
         places = {
-            axis: replace(place, numbers=((f"{load}:pos[{i}]", 1.0),))
+            axis: TermQuantity(
+                value=0.0, unit="m", size=length, numbers=((f"{load}:pos[{i}]", 1.0),)
+            )
             for i, axis in enumerate(AXES)
         }
-        quantities = stated_quantities(
-            cls.kind, table, {"mass": mass, **places, "inertia": inertia}
+        defaults = {"mass": mass, **places, "inertia": inertia}
+        return cls(
+            name=table.name,
+            body=name,
+            quantities=stated_quantities(cls.kind, table, defaults),
         )
-        return cls(name=table.name, body=name, quantities=quantities)
 
     @classmethod
     def shapes(cls, model: Any, element: str, speed: float) -> list[Shape]:

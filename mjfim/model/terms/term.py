@@ -45,19 +45,9 @@ NON_NEGATIVE = (0.0, np.inf)
 FILTERS = (int(mujoco.mjtDyn.mjDYN_FILTER), int(mujoco.mjtDyn.mjDYN_FILTEREXACT))
 
 
-@dataclass(frozen=True)
-class FieldDescription:
-    """A field of a kind of term, in words.
-
-    Attributes:
-        name: Name of the field in paths `term/<name>:<field>`.
-        description: What the number is, with its letter in the equation.
-        unit: Its unit; where it depends on the joint, that at a hinge.
-    """
-
-    name: str
-    description: str
-    unit: str
+# A field of a kind of term: its name in paths `term/<name>:<field>`, what the number is, and its
+# unit, which is that at a hinge where it depends on the joint.
+Field = tuple[str, str, str]
 
 
 @record
@@ -124,7 +114,7 @@ class Term(ABC):
     equation: ClassVar[str]
     elements: ClassVar[str]
     acts_on: ClassVar[str]
-    fields: ClassVar[tuple[FieldDescription, ...]]
+    fields: ClassVar[tuple[Field, ...]]
     sources: ClassVar[tuple[str, ...]]
     is_written_as_a_whole: ClassVar[bool] = False
     words: ClassVar[str] = ""

@@ -7,7 +7,7 @@ numbers differ states those of the identified one. A file is written only if it 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from copy import deepcopy
 from datetime import date
 from pathlib import Path
@@ -127,6 +127,11 @@ def state_differences(xml: ModelXml, compiled: tuple[Any, Any], wanted: Any) -> 
             compiled = xml.compiled()
 
 
+def _differing(before: Mapping[str, Array], after: Mapping[str, Array]) -> list[str]:
+    """The attributes whose numbers differ."""
+    return [name for name in before if not nearly_equal(before[name], after[name]).all()]
+
+
 class _Statement:
     """States in a text those numbers of a wanted model that differ from its own.
 
@@ -140,12 +145,13 @@ class _Statement:
         self._spec = spec
         self._found = found
         self._wanted = wanted
+        self._models = (found, wanted)
 
     def state(self, kind: str, i: int) -> None:
         """State the numbers of the element of a kind with a number."""
-        before, after = (_numbers(model, kind, i) for model in (self._found, self._wanted))
-        differing = [name for name in before if not nearly_equal(before[name], after[name]).all()]
-        is_moved = kind == "body" and differ_in_inertia(self._found, self._wanted, i, ROUNDING)
+        before, after = (_numbers(model, kind, i) for model in self._models)
+        differing = _differing(before, after)
+        is_moved = kind == "body" and differ_in_inertia(*self._models, i, ROUNDING)
         if not differing and not is_moved:
             return
 
@@ -168,9 +174,7 @@ class _Statement:
     def state_options(self) -> None:
         """State the options that differ, where the text states them last."""
         for field in MODEL_ARRAYS["option"]:
-            before, after = (
-                np.atleast_1d(getattr(model.opt, field)) for model in (self._found, self._wanted)
-            )
+            before, after = (np.atleast_1d(getattr(model.opt, field)) for model in self._models)
             if not nearly_equal(before, after).all():
                 self.is_changed = True
                 options = self._xml.sections("option") or [child(self._xml.root, "option")]
@@ -180,19 +184,20 @@ class _Statement:
     def _set(self, element: Any, attribute: str, before: Array, after: Array) -> None:
         """State numbers in the unit and the frame of an attribute."""
         least = LEAST.get(attribute, 1)
+        name = element.get("name")
         if attribute == "springref" and self._spec.compiler.degree:
-            kind = self._spec.joint(element.get("name")).type
-            factor = np.rad2deg(1.0) if kind == mujoco.mjtJoint.mjJNT_HINGE else 1.0
-            before, after = factor * before, factor * after
+            if self._spec.joint(name).type == mujoco.mjtJoint.mjJNT_HINGE:
+                before, after = np.rad2deg(before), np.rad2deg(after)
         elif attribute == "springlength":
             # One rest length sets both ends of the range.
             is_range = after[0] != after[1] or " " in element.get(attribute, "").strip()
             least = 2 if is_range else 1
             before, after = before[:least], after[:least]
-        elif element.tag == "geom" and attribute == "pos" and element.get("mesh"):
-            # The compiler adds the offset of a mesh to its position.
-            stated = self._spec.geom(element.get("name")).pos
-            before, after = stated, stated + (after - before)
+        elif attribute == "pos" and element.get("mesh"):
+            # The compiler adds the offset of a mesh to the position of its geom.
+            stated = self._spec.geom(name).pos
+            after = stated + (after - before)
+            before = stated
         elif attribute in ("pos", "quat"):
             before, after = (_in_frames(element, attribute, each) for each in (before, after))
         set_numbers(element, attribute, before, after, least)
@@ -217,9 +222,7 @@ class _Statement:
             inertial = add_element(element, "inertial", first=True)
         has_axes = "diaginertia" in inertial.attrib
         for attribute, array in INERTIAL.items():
-            before, after = (
-                np.atleast_1d(getattr(model, array)[body]) for model in (self._found, self._wanted)
-            )
+            before, after = (np.atleast_1d(getattr(model, array)[body]) for model in self._models)
             known = before if has_axes else np.full(len(after), np.nan)
             set_numbers(inertial, attribute, known, after, len(after))
 

@@ -12,6 +12,7 @@ import logging
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -101,25 +102,7 @@ def sysid_problem(system: System, recordings: Sequence[Recording]) -> SysidProbl
     """State the fit of recordings of a resolved experiment. See `export_sysid`."""
     require_sysid()
     _check_expressible(system)
-    mapping = {
-        name: (sysid.SignalType.CustomObs, np.array([i]))
-        for i, name in enumerate(system.outputs.names)
-    }
-    aligned = [align(system, recording) for recording in recordings]
-    qpos, qvel, act = system.space.split(system.plant.initial_state(system.parameters.guess))
-    start = sysid.create_initial_state(system.model, qpos, qvel, act)
-
-    # sysid warns, because it expects the sensors of the model.
-    with silenced():
-        sequences = sysid.ModelSequences(
-            system.model_path.stem,
-            system.source.spec.copy(),
-            [recording.name for recording in aligned],
-            [start] * len(aligned),
-            [_control(system, recording.ctrl) for recording in aligned],
-            [sysid.TimeSeries(np.array(each.t), each.y, mapping) for each in aligned],
-            allow_missing_sensors=True,
-        )
+    sequences = _sequences(system, recordings)
 
     def build_model(parameters: Any, _: Any) -> Any:
         return system.model_at(np.array(parameters.as_vector()))
@@ -131,10 +114,33 @@ def sysid_problem(system: System, recordings: Sequence[Recording]) -> SysidProbl
         residual=sysid.build_residual_fn(
             models_sequences=[sequences],
             build_model=build_model,
-            modify_residual=_whitened(system),
+            modify_residual=partial(_whitened, system),
             resample_true=False,
         ),
     )
+
+
+def _sequences(system: System, recordings: Sequence[Recording]) -> Any:
+    """The recordings and the start of the motion, as sysid takes them."""
+    mapping = {
+        name: (sysid.SignalType.CustomObs, np.array([i]))
+        for i, name in enumerate(system.outputs.names)
+    }
+    aligned = [align(system, recording) for recording in recordings]
+    qpos, qvel, act = system.space.split(system.plant.initial_state(system.parameters.guess))
+    start = sysid.create_initial_state(system.model, qpos, qvel, act)
+
+    # sysid warns, because it expects the sensors of the model.
+    with silenced():
+        return sysid.ModelSequences(
+            system.model_path.stem,
+            system.source.spec.copy(),
+            [recording.name for recording in aligned],
+            [start] * len(aligned),
+            [_control(system, recording.ctrl) for recording in aligned],
+            [sysid.TimeSeries(np.array(each.t), each.y, mapping) for each in aligned],
+            allow_missing_sensors=True,
+        )
 
 
 @contextmanager
@@ -195,33 +201,35 @@ def _check_expressible(system: System) -> None:
         raise ExperimentError(f"{experiment.source}: {fault}")
 
 
-def _whitened(system: System) -> Callable[..., Any]:
-    """The `modify_residual` of sysid that gives all residuals in units of their noise."""
+def _whitened(
+    system: System,
+    _: Any,
+    predicted: Any,
+    measured: Any,
+    model: Any,
+    __: bool,
+    state: Array,
+    **___: Any,
+) -> tuple[Array, Any, Any]:
+    """Residuals after time 0 in units of their noise, and both TimeSeries, as sysid asks for them.
 
-    def modify(
-        _: Any, predicted: Any, measured: Any, model: Any, __: bool, state: Array, **___: Any
-    ) -> tuple[Array, Any, Any]:
-        """Residuals after time 0, and both TimeSeries.
+    Row 0 of the sensors belongs to the time 0, that of the state (with the time in its first
+    column) is after the first engine step.
+    """
+    after_start = measured.times > 0.0
+    t, y = measured.times[after_start], measured.data[after_start]
+    steps = t / float(model.opt.timestep)
+    found = np.empty_like(y)
+    for i, output in enumerate(system.outputs.outputs):
+        if output.sensor is not None:
+            found[:, i] = _at_rows(predicted.data[:, output.sensor], steps)
+        else:
+            found[:, i] = _at_rows(state[:, 1 + (output.state or 0)], steps - 1)
 
-        Row 0 of the sensors belongs to the time 0, that of the state (with the time in its first
-        column) is after the first engine step.
-        """
-        after_start = measured.times > 0.0
-        t, y = measured.times[after_start], measured.data[after_start]
-        steps = t / float(model.opt.timestep)
-        found = np.empty_like(y)
-        for i, output in enumerate(system.outputs.outputs):
-            if output.sensor is not None:
-                found[:, i] = _at_rows(predicted.data[:, output.sensor], steps)
-            else:
-                found[:, i] = _at_rows(state[:, 1 + (output.state or 0)], steps - 1)
-
-        present = np.isfinite(y)
-        residual = np.where(present, y - found, 0.0)
-        pair = [sysid.TimeSeries(t, each, measured.signal_mapping) for each in (found, y)]
-        return system.noise.whiten_present(residual, present), *pair
-
-    return modify
+    present = np.isfinite(y)
+    residual = np.where(present, y - found, 0.0)
+    pair = [sysid.TimeSeries(t, each, measured.signal_mapping) for each in (found, y)]
+    return system.noise.whiten_present(residual, present), *pair
 
 
 def _at_rows(values: Array, rows: Array) -> Array:

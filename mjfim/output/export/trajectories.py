@@ -22,7 +22,7 @@ from __future__ import annotations
 import json
 import shutil
 import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -552,29 +552,37 @@ def write_bag(folder: Path, plan: RobotPlan, trajectory: JointTrajectory, storag
         with rosbag2.Writer(written, version=BAG_VERSION, storage_plugin=plugin) as bag:
             topics = {
                 topic: bag.add_connection(topic, kind, typestore=store)
-                for topic, kind in (
-                    (TRAJECTORY_TOPIC, TRAJECTORY_TYPE),
-                    (PLANNED_TOPIC, JOINT_STATE),
-                    (CONTROL_TOPIC, JOINT_STATE),
-                )
+                for topic, kind in TOPICS.items()
             }
-            for topic, kind, stamp, message in _messages(store.types, plan, trajectory):
-                bag.write(topics[topic], stamp, store.serialize_cdr(message, kind))
+            for topic, stamp, message in _messages(store.types, plan, trajectory):
+                bag.write(topics[topic], stamp, store.serialize_cdr(message, TOPICS[topic]))
 
         # The data first, which the metadata describe.
-        for file in (f"{name}{ENDINGS[storage]}", "metadata.yaml"):
-            with replacing(folder / file) as temporary:
-                shutil.copyfile(written / file, temporary)
-    for other, ending in ENDINGS.items():
-        stale = folder / f"{name}{ending}"
-        if other != storage and stale.is_file():
-            remove_earlier_result(stale)
+        _copy_files(written, folder, (f"{name}{ENDINGS[storage]}", "metadata.yaml"))
+
+
+def _copy_files(written: Path, folder: Path, files: Sequence[str]) -> None:
+    """Copy the files of a bag into its folder, and remove data in another format."""
+    for file in files:
+        with replacing(folder / file) as temporary:
+            shutil.copyfile(written / file, temporary)
+    for file in {*bag_files(folder)} - {*files}:
+        if (folder / file).is_file():
+            remove_earlier_result(folder / file)
+
+
+# Topics of a bag, with the types of their messages.
+TOPICS = {
+    TRAJECTORY_TOPIC: TRAJECTORY_TYPE,
+    PLANNED_TOPIC: JOINT_STATE,
+    CONTROL_TOPIC: JOINT_STATE,
+}
 
 
 def _messages(
     types: Any, plan: RobotPlan, trajectory: JointTrajectory
-) -> Iterator[tuple[str, str, int, Any]]:
-    """The messages of a bag: topic, type, time stamp [ns] and contents."""
+) -> Iterator[tuple[str, int, Any]]:
+    """The messages of a bag: topic, time stamp [ns] and contents."""
     nothing = np.zeros(0)
 
     def header(stamp: int) -> Any:
@@ -595,7 +603,7 @@ def _messages(
         point = types["trajectory_msgs/msg/JointTrajectoryPoint"]
         points.append(point(**row, time_from_start=duration))
     message = types[TRAJECTORY_TYPE](header(0), trajectory.joints, points)
-    yield TRAJECTORY_TOPIC, TRAJECTORY_TYPE, START, message
+    yield TRAJECTORY_TOPIC, START, message
 
     joints = [joint.name for joint in plan.system.coordinates]
     planned = [plan.columns(field, joints) for field in ("qpos", "qvel", "force")]
@@ -604,6 +612,6 @@ def _messages(
     for k, t in enumerate(plan.playback.t.tolist()):
         stamp = START + round(t * NANOSECONDS)
         rows = [np.ascontiguousarray(values[k]) for values in planned]
-        yield PLANNED_TOPIC, JOINT_STATE, stamp, state(header(stamp), joints, *rows)
+        yield PLANNED_TOPIC, stamp, state(header(stamp), joints, *rows)
         sent = state(header(stamp), controls, nothing, nothing, plan.held_control[k])
-        yield CONTROL_TOPIC, JOINT_STATE, stamp, sent
+        yield CONTROL_TOPIC, stamp, sent

@@ -6,6 +6,7 @@ It is written only if MuJoCo reads these values from it, and everything else as 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -106,12 +107,7 @@ def write_identified_urdfs(
     names = urdf_files(path, system.model_path)
     for name, (source, prefixes) in zip(names, sources.items(), strict=True):
         try:
-            if len(prefixes) > 1:
-                raise ModelError(
-                    f"{source.name} is attached {len(prefixes)} times, and one URDF has one set of "
-                    "values"
-                )
-            _write(path.with_name(name), source, prefixes[0], system, wanted)
+            _write(path.with_name(name), source, _only_prefix(source, prefixes), system, wanted)
         except ModelError as error:
             remarks.append(f"{name}: not written: {error}")
         else:
@@ -137,6 +133,15 @@ def _is_held(parameter: Parameter) -> bool:
         path.field in HELD_FIELDS.get(path.kind, ()) and (path.kind == "body" or not path.component)
         for path in paths
     )
+
+
+def _only_prefix(source: Path, prefixes: Sequence[str]) -> str:
+    """The prefix of the names of a URDF that is attached once; ModelError for others."""
+    if len(prefixes) > 1:
+        raise ModelError(
+            f"{source.name} is attached {len(prefixes)} times, and one URDF has one set of values"
+        )
+    return prefixes[0]
 
 
 def _write(path: Path, source: Path, prefix: str, system: System, wanted: Any) -> None:

@@ -52,7 +52,7 @@ from mjfim.records.design import (
     is_playable,
     keeps_limits,
 )
-from mjfim.records.rehearsal import REST_SHARE, LimitRange, Rehearsal, Valley
+from mjfim.records.rehearsal import REST_SHARE, Fan, LimitRange, Rehearsal, Valley
 
 # Ratio of two standard deviations above which one of them counts as smaller.
 RELEVANT_RATIO = 1.05
@@ -86,9 +86,6 @@ def design_page(design: Design) -> Page:
     search: list[Part] = [_eigenvalue_table(design), Plot("convergence", detail=True)]
     if len(design.starts) > 1:
         search.append(_start_table(design))
-    margins = numbers(design.limits.values())
-    columns = {"limit": [*design.limits], "worst margin (negative: violated)": margins}
-    limits = tabulated("Limits", columns, detail=design.rehearsal is not None)
     before, after = _least_eigenvalues(design)
     reserve = listed([f"{100 * share:.2g} % of {kind}" for kind, share in design.reserve.items()])
     return Page(
@@ -108,7 +105,7 @@ def design_page(design: Design) -> Page:
             "Two robots": _valley_parts(design.valley),
             "Rehearsal": _rehearsal_parts(design.rehearsal),
             "Motion": [Plot("trajectories")],
-            "Limits": [Plot("limits"), limits] if design.limits else (),
+            "Limits": _limit_parts(design),
             "Optimisation": search,
             "What would help": worth_parts(design.worth, detail=True),
         },
@@ -194,6 +191,13 @@ def _faults(rehearsal: Rehearsal) -> Iterator[str]:
     if rehearsal.passes_floor.any():
         passing, deepest = _that(rehearsal.below_floor, "pass"), -np.nanmin(rehearsal.lowest)
         yield f"{passing} through {_floor(rehearsal)}, by up to {deepest:.3g} m"
+    yield from _left_limits(rehearsal)
+    for name, count in rehearsal.unbraked.items():
+        yield f"{_that(count, 'end')} too fast to be braked before the limit of {name}"
+
+
+def _left_limits(rehearsal: Rehearsal) -> Iterator[str]:
+    """Say which limits robots leave, the least kept first."""
     worst = finite_or_nan(rehearsal.margins)
     broken = np.flatnonzero(~rehearsal.kept.all(axis=0))
     order = np.lexsort((rehearsal.kept[:, broken].sum(axis=0), rehearsal.is_clamped[broken]))
@@ -202,8 +206,6 @@ def _faults(rehearsal: Rehearsal) -> Iterator[str]:
         excess = -np.nanmin(worst[:, i]) * limit.scale
         manner = f"by up to {excess:.3g} {limit.unit}".rstrip() if excess > 0.0 else "to its clamp"
         yield f"{_that(count, 'leave')} the limit on {_kind(limit)} of {limit.name}, {manner}"
-    for name, count in rehearsal.unbraked.items():
-        yield f"{_that(count, 'end')} too fast to be braked before the limit of {name}"
 
 
 def _floor(rehearsal: Rehearsal) -> str:
@@ -236,16 +238,16 @@ def _observed(rehearsal: Rehearsal) -> Iterator[str]:
     speeds = _unlimited("speed", rehearsal, rehearsal.unlimited, rehearsal.speed, rehearsal.units)
     if speeds:
         yield f"{speeds}."
-    ends = rehearsal.end_speed[0]
-    moving = np.flatnonzero(ends > REST_SHARE * rehearsal.speed[0]).tolist()
-    if moving:
-        moving.sort(key=lambda i: -ends[i] / rehearsal.speed[0, i])
-        named_ends = [
-            f"{rehearsal.joints[i]} at {ends[i]:.2g} {rehearsal.units[i]}" for i in moving
-        ]
-        yield f"It ends in motion: {first_ones(named_ends)}."
-    else:
-        yield "It ends at rest."
+    moving = _moving_at_end(rehearsal)
+    yield f"It ends in motion: {first_ones(moving)}." if moving else "It ends at rest."
+
+
+def _moving_at_end(rehearsal: Rehearsal) -> list[str]:
+    """The joints that move at the end, with their speeds, that of the fastest first."""
+    ends, largest = rehearsal.end_speed[0], rehearsal.speed[0]
+    moving = np.flatnonzero(ends > REST_SHARE * largest).tolist()
+    moving.sort(key=lambda i: -ends[i] / largest[i])
+    return [f"{rehearsal.joints[i]} at {ends[i]:.2g} {rehearsal.units[i]}" for i in moving]
 
 
 def _unlimited(
@@ -470,16 +472,7 @@ def _rehearsal_parts(rehearsal: Rehearsal | None, *, is_detail: bool = False) ->
     if rehearsal.limits:
         yield replace(_margin_table(rehearsal), detail=is_detail)
     if rehearsal.fans:
-        limits = [fan.limit for fan in rehearsal.fans]
-        yield tabulated(
-            "Half width of the range in which 90 % of the robots are, at its widest",
-            {
-                "quantity": [named(f"{_kind(each)} of {each.name}", each.unit) for each in limits],
-                "before": numbers(fan.spread_before for fan in rehearsal.fans),
-                "after the experiment": numbers(fan.spread_after for fan in rehearsal.fans),
-            },
-            detail=True,
-        )
+        yield _fan_table(rehearsal.fans)
     yield tabulated(
         "Largest speeds and accelerations of the model and of all robots",
         {
@@ -497,6 +490,20 @@ def _rehearsal_parts(rehearsal: Rehearsal | None, *, is_detail: bool = False) ->
     )
     is_assumed = np.isfinite(rehearsal.floor) and not rehearsal.has_floor
     yield Text(_surroundings(rehearsal), detail=is_detail or not is_assumed)
+
+
+def _fan_table(fans: Sequence[Fan]) -> Table:
+    """Tabulate how far the robots are apart before and after the experiment."""
+    limits = [fan.limit for fan in fans]
+    return tabulated(
+        "Half width of the range in which 90 % of the robots are, at its widest",
+        {
+            "quantity": [named(f"{_kind(each)} of {each.name}", each.unit) for each in limits],
+            "before": numbers(fan.spread_before for fan in fans),
+            "after the experiment": numbers(fan.spread_after for fan in fans),
+        },
+        detail=True,
+    )
 
 
 def _valley_parts(valley: Valley | None) -> Sequence[Part]:
@@ -550,6 +557,14 @@ def _margin_table(rehearsal: Rehearsal) -> Table:
         columns,
         warned([count < rehearsal.robots for count in kept]),
     )
+
+
+def _limit_parts(design: Design) -> Iterator[Part]:
+    if design.limits:
+        yield Plot("limits")
+        margins = numbers(design.limits.values())
+        columns = {"limit": [*design.limits], "worst margin (negative: violated)": margins}
+        yield tabulated("Limits", columns, detail=design.rehearsal is not None)
 
 
 # ---- sentences
@@ -616,17 +631,15 @@ def _scaled_sentence(design: Design, scaled: ScaledStart) -> str:
 
 def _accuracy_table(design: Design) -> Table:
     """Tabulate the predicted standard deviations before and after a design."""
-    wanted, combined = list(design.wanted), design.combined
-    units = design.labels.parameter_units
-    names = [named(design.parameters[j], units[j]) for j in wanted]
-    values = [*design.theta[wanted], *(each.value for each in combined)]
+    wanted, combined, rows = list(design.wanted), design.combined, design.rows
     sizes = [*design.sizes[wanted], *(abs(each.value) for each in combined)]
-    before = [*design.initial.std[wanted], *(each.std_initial for each in combined)]
-    after = [*design.stated_std[wanted], *(each.std_final for each in combined)]
+    values = [each.value for each in rows]
+    before = [each.further["std_initial"] for each in rows]
+    after = [each.std for each in rows]
     return tabulated(
         "Predicted standard deviation σ of each parameter after one experiment",
         {
-            "parameter": [*names, *(each.expression for each in combined)],
+            "parameter": [named(each.name, each.unit) for each in rows],
             "value": numbers(values, 4),
             "σ initial": numbers(before, infinite=NOT_ALONE),
             "relative σ initial": list(map(relative, before, sizes)),
@@ -811,9 +824,7 @@ def _row(row: ParameterCheck) -> Row:
 
 def _groups(title: str, groups: tuple[ParameterGroup, ...], check: Check) -> Iterator[Part]:
     """Groups of parameters, with a line per combination, its value and its σ."""
-    accuracy = {
-        each.expression: f" = {each.value:.4g} ± {each.std_final:.2g}" for each in check.combined
-    }
+    accuracy = {each.name: f" = {each.value:.4g} ± {each.std:.2g}" for each in check.combined}
     items = []
     for group in groups:
         combinations = [" ".join(combination_terms(each)) for each in group.combinations]

@@ -63,22 +63,8 @@ def estimate_page(estimate: Estimate) -> Page:
     """Describe estimates with intervals, the fit of every output, and predictions."""
     rms = estimate.residual_rms
     residuals = {"output": [*rms], "residual rms": numbers(rms.values())}
-    parts: dict[str, Sequence[Part]] = {
-        "Parameters": [*_parameter_parts(estimate), *_correlation_tables(estimate)],
-        "Which seconds decide": _seconds_parts(estimate.in_time),
-        "Added terms": [] if estimate.selection is None else selection_parts(estimate.selection),
-        "Length of the segments": horizon_parts(estimate.horizons),
-        "Recordings": recording_parts(estimate),
-        "Drawn robots": list(sample_parts(estimate)),
-        "Predictions": _prediction_parts(estimate.predictions),
-        "Signals": [Plot("fit")] if estimate.recordings else [],
-        "Residual torque": residual_parts(estimate.residual_forces),
-        "Residuals": [
-            tabulated("Fit of every output", residuals, detail=True),
-            Plot("spectra", detail=True),
-        ],
-    }
-    causes, details = estimate.causes, estimate.details
+    causes = estimate.causes
+    details = estimate.details
     return Page(
         kind="Identification from recordings",
         verdict=_verdict(estimate),
@@ -86,15 +72,33 @@ def estimate_page(estimate: Estimate) -> Page:
         causes=tuple(_with_files(cause, estimate) for cause in causes),
         warnings=tuple(each for each in estimate.warnings if each not in (*causes, *details)),
         details=details,
-        facts={
-            "recordings": str(len(estimate.recordings)),
-            "χ²/dof": f"{estimate.chi2 / max(estimate.dof, 1):.3f}",
-            "degrees of freedom": f"{estimate.dof:,}",
-            "iterations": str(estimate.iterations),
-            "time of the fit": f"{estimate.seconds:.3g} s",
+        facts=_facts(estimate),
+        sections={
+            "Parameters": [*_parameter_parts(estimate), *_correlation_tables(estimate)],
+            "Which seconds decide": _seconds_parts(estimate.in_time),
+            "Added terms": selection_parts(estimate.selection),
+            "Length of the segments": horizon_parts(estimate.horizons),
+            "Recordings": recording_parts(estimate),
+            "Drawn robots": sample_parts(estimate),
+            "Predictions": _prediction_parts(estimate.predictions),
+            "Signals": [Plot("fit")] if estimate.recordings else (),
+            "Residual torque": residual_parts(estimate.residual_forces),
+            "Residuals": [
+                tabulated("Fit of every output", residuals, detail=True),
+                Plot("spectra", detail=True),
+            ],
         },
-        sections=parts,
     )
+
+
+def _facts(estimate: Estimate) -> dict[str, str]:
+    return {
+        "recordings": str(len(estimate.recordings)),
+        "χ²/dof": f"{estimate.chi2 / max(estimate.dof, 1):.3f}",
+        "degrees of freedom": f"{estimate.dof:,}",
+        "iterations": str(estimate.iterations),
+        "time of the fit": f"{estimate.seconds:.3g} s",
+    }
 
 
 def _with_files(sentence: str, estimate: Estimate) -> str:
@@ -125,22 +129,22 @@ def _verdict_on_fit(estimate: Estimate) -> Verdict:
         return Verdict(f"These estimates are not reliable: {why}.", Level.BAD)
     # A search that is stopped early has not tried all that may explain the recordings.
     if estimate.interrupted:
-        text = (
+        return Verdict(
             "Interrupted: the estimates are the best ones that were found until then, and the "
-            f"residuals are {ratio:.2f} times the noise."
+            f"residuals are {ratio:.2f} times the noise.",
+            Level.DOUBTFUL,
         )
-        return Verdict(text, Level.DOUBTFUL)
     model = "The model"
     if estimate.selection is not None and estimate.selection.terms:
         terms = first_ones([term.description for term in estimate.selection.terms])
         model = f"With {terms} added, the model"
     if estimate.misfit:
         size = f"the residuals are {ratio:.2f} times the noise"
-        text = (
+        return Verdict(
             f"{model} does not explain the recordings: {'; '.join(estimate.reasons) or size}. "
-            "The true errors may exceed the intervals."
+            "The true errors may exceed the intervals.",
+            Level.DOUBTFUL,
         )
-        return Verdict(text, Level.DOUBTFUL)
     text = f"{model} explains the recordings: the residuals are {ratio:.2f} times the noise"
     if is_larger_than_noise(estimate.chi2, estimate.dof):
         text = (
@@ -212,6 +216,11 @@ def _parameter_parts(estimate: Estimate) -> Iterator[Part]:
     if estimate.tested_data is not None and estimate.tested_data.unseen:
         yield Text(estimate.tested_data.unseen_sentence, Emphasis.WEAK, detail=True)
     yield Text(ABOUT_STD, Emphasis.WEAK)
+    yield from _fit_parts(estimate)
+
+
+def _fit_parts(estimate: Estimate) -> Iterator[Part]:
+    """The control laws in the loop, values of single recordings, and the effort of the fit."""
     for law in estimate.controllers:
         yield Text(str(law))
         yield Text(f"In the experiment file: {law.toml}", detail=True)
@@ -362,8 +371,10 @@ WORDS = {
 }
 
 
-def selection_parts(selection: Selection) -> Sequence[Part]:
+def selection_parts(selection: Selection | None) -> Sequence[Part]:
     """Terms that were added, the steps that led to them, and what they depend on."""
+    if selection is None:
+        return ()
     steps = Table(
         title="Terms that were tried: error of data that were left out of the fit",
         columns=("term", "decision", "terms", "error [σ]", "reduction [σ²]", "± standard error"),
@@ -378,7 +389,7 @@ def selection_parts(selection: Selection) -> Sequence[Part]:
         if step.alternatives and step.path in kept
     ]
     if selection.refit is not None:
-        differs = selection.refit.differs
+        differs = selection.refit[2]
         same = "the same parameters within the intervals."
         other = (
             f"other values of {listed(differs)}, by more than both intervals explain; the "

@@ -16,6 +16,7 @@ from mjfim.output.page import (
     Table,
     named,
     number,
+    numbers,
 )
 from mjfim.recordings.read import ColumnSummary, LogSummary
 from mjfim.records.base import Level, Verdict
@@ -49,7 +50,7 @@ def inventory_page(inventory: Inventory) -> Page:
         _table(
             "Parameters: paths for `target`",
             "path, value, unit",
-            [(p.path, _known(p.value), p.unit) for p in inventory.parameters],
+            [(path, _known(value), unit) for path, value, unit in inventory.parameters],
         ),
         _table(
             "Outputs: names for `[noise]` and for columns of recordings",
@@ -59,16 +60,13 @@ def inventory_page(inventory: Inventory) -> Page:
         _table(
             "Actuators: names for `initial.control` and columns of controls",
             "name, drives, unit of the control",
-            [(a.name, a.drives, a.unit) for a in inventory.actuators],
+            inventory.actuators,
         ),
         _table(
             "Keyframes: names for `initial.keyframe`",
             "name, qpos, ctrl",
             [
-                (
-                    k.name or "(no name)",
-                    *(" ".join(f"{x:.4g}" for x in v) for v in (k.qpos, k.ctrl)),
-                )
+                (k.name or "(no name)", " ".join(numbers(k.qpos, 4)), " ".join(numbers(k.ctrl, 4)))
                 for k in inventory.keyframes
             ],
         ),
@@ -86,8 +84,12 @@ def inventory_page(inventory: Inventory) -> Page:
             [(t.kind, ", ".join(t.elements), ", ".join(t.fields)) for t in inventory.terms],
         ),
     )
-    remarks = [Listing("Remarks", inventory.remarks)] if inventory.remarks else []
-    return _page(inventory.model, "", tables, remarks)
+    return _page(
+        inventory.model,
+        "",
+        tables,
+        [Listing("Remarks", inventory.remarks)] if inventory.remarks else [],
+    )
 
 
 def _known(value: float | None) -> str:

@@ -210,19 +210,21 @@ MAX_MATRIX = 5
 
 # ---- comparison of methods
 
+# What two columns hold.
+LEGEND = (
+    "worst σ: standard deviation of the worst combination of parameters, relative to their scales; "
+    "worst margin: smallest margin of all limits, in percent of half of the range."
+)
+
 
 def comparison_page(comparison: Comparison) -> Page:
     """Describe the result of each method with equal budgets, and which is the best."""
     parts: list[Part] = [_method_table(comparison), Plot("compare")]
     for row in comparison.rows:
-        remarks = [each for each in ("" if row.sound else row.outcome.value, row.note) if each]
+        remarks = "; ".join(filter(None, ["" if row.sound else row.outcome.value, row.note]))
         if remarks:
-            parts.append(Text(f"{row.title}: {'; '.join(remarks)}"))
-    legend = (
-        "worst σ: standard deviation of the worst combination of parameters, relative to their "
-        "scales; worst margin: smallest margin of all limits, in percent of half of the range."
-    )
-    parts += [Text(f"{legend} {BEST_CASE}", Emphasis.WEAK), _std_table(comparison)]
+            parts.append(Text(f"{row.title}: {remarks}"))
+    parts += [Text(f"{LEGEND} {BEST_CASE}", Emphasis.WEAK), _std_table(comparison)]
     steps: tuple[str, ...] = (
         "Rehearse a design before a robot plays it: `mjfim design EXPERIMENT -o FOLDER`. No "
         "control of this comparison was rehearsed; each is a table beside this file.",
@@ -233,12 +235,9 @@ def comparison_page(comparison: Comparison) -> Page:
             f"Begin a design at the control of {name}: state its table as `initial.control`.",
             "Give all methods more time with `--seconds`.",
         )
-    design = comparison.design
-    is_sound = design is not None and design.sound and not comparison.interrupted
-    ok = is_sound and not comparison.beating
     return Page(
         kind="Comparison with other excitations",
-        verdict=Verdict(comparison.findings[0], Level.GOOD if ok else Level.DOUBTFUL, ok),
+        verdict=_verdict_on_design(comparison),
         next_steps=steps,
         warnings=comparison.findings[1:],
         facts={
@@ -249,6 +248,14 @@ def comparison_page(comparison: Comparison) -> Page:
         },
         sections={"Methods": parts},
     )
+
+
+def _verdict_on_design(comparison: Comparison) -> Verdict:
+    """Say whether the design is the best method."""
+    design = comparison.design
+    is_sound = design is not None and design.sound and not comparison.interrupted
+    ok = is_sound and not comparison.beating
+    return Verdict(comparison.findings[0], Level.GOOD if ok else Level.DOUBTFUL, ok)
 
 
 def budget_in_words(comparison: Comparison) -> str:
@@ -278,16 +285,13 @@ def _method_table(comparison: Comparison) -> Table:
 
 def _method_row(comparison: Comparison, row: MethodResult) -> Row:
     """The row of one method; the best method has an arrow."""
-    design, (kind, relative_margin) = comparison.design, row.tightest
+    design = comparison.design
+    kind, relative_margin = row.tightest
     against_design = ""
     if design is not None and row is not design and not np.isnan(row.cost):
         share = -comparison.gain(row, design)
-        against_design = f"{100.0 * share:+.3g} %"
-        if share >= LARGE_DIFFERENCE:
-            against_design = f"× {1.0 + share:.3g}"
-    margin = "-"
-    if kind and np.isfinite(relative_margin):
-        margin = f"{100.0 * relative_margin:.2g} % {kind.replace('_', ' ')}"
+        percent = f"{100.0 * share:+.3g} %"
+        against_design = percent if share < LARGE_DIFFERENCE else f"× {1.0 + share:.3g}"
     emphasis = Emphasis.WARNING if row in comparison.beating else Emphasis.NORMAL
     if row.method == DESIGN:
         emphasis = Emphasis.STRONG
@@ -300,7 +304,7 @@ def _method_row(comparison: Comparison, row: MethodResult) -> Row:
             number(row.worst_relative_std),
             f"{row.seconds:.1f} s",
             f"{row.steps / 1e6:.2f} M",
-            margin,
+            number(100.0 * relative_margin, 2, f" % {kind.replace('_', ' ')}", infinite="-"),
         ),
         emphasis if row.sound else Emphasis.WEAK,
     )
@@ -551,31 +555,35 @@ LONG_SECONDS = 3600.0
 
 def watch_page(watch: Watch) -> Page:
     """Describe how accurate the parameters are by the rows so far; open ones come first."""
+    level = Level.GOOD if watch.enough else Level.DOUBTFUL
+    return Page(
+        kind="Live meter",
+        verdict=Verdict(progress_of_watch(watch), level, watch.enough),
+        warnings=watch.warnings,
+        facts={"rows": str(watch.rows), "duration": f"{watch.seconds:.1f} s"},
+        sections={"Accuracy so far": [_table_of_watch(watch), Plot("watch")]},
+    )
+
+
+def _table_of_watch(watch: Watch) -> Table:
+    """Tabulate σ so far, that of open parameters first."""
     order = np.argsort(np.isfinite(watch.reached), kind="stable")
     std, wanted, reached = watch.std[order], watch.wanted[order], watch.reached[order]
-    columns = {
-        "parameter": parameter_names(watch, order),
-        "σ now": numbers(std, infinite=NOT_ALONE),
-        "of the value": list(map(relative, std.tolist(), watch.sizes[order].tolist())),
-        "wanted": numbers(wanted, infinite=""),
-        "enough": [f"at {t:.1f} s" if np.isfinite(t) else "" for t in reached],
-    }
     title = f"After {watch.seconds:.1f} s, {watch.rows} rows"
     if watch.left_out:
         title += f"; faulty rows, left out: {watch.left_out}"
-    marked = warned(np.isfinite(wanted) & np.isinf(reached))
-    note = f"At the guess. {BEST_CASE}"
-    table = tabulated(title, columns, marked, spare=("of the value",), note=note)
-    return Page(
-        kind="Live meter",
-        verdict=Verdict(
-            progress_of_watch(watch),
-            Level.GOOD if watch.enough else Level.DOUBTFUL,
-            watch.enough,
-        ),
-        warnings=watch.warnings,
-        facts={"rows": str(watch.rows), "duration": f"{watch.seconds:.1f} s"},
-        sections={"Accuracy so far": [table, Plot("watch")]},
+    return tabulated(
+        title,
+        {
+            "parameter": parameter_names(watch, order),
+            "σ now": numbers(std, infinite=NOT_ALONE),
+            "of the value": list(map(relative, std, watch.sizes[order])),
+            "wanted": numbers(wanted, infinite=""),
+            "enough": [f"at {t:.1f} s" if np.isfinite(t) else "" for t in reached],
+        },
+        warned(np.isfinite(wanted) & np.isinf(reached)),
+        spare=("of the value",),
+        note=f"At the guess. {BEST_CASE}",
     )
 
 

@@ -47,23 +47,27 @@ def worth_page(worth: Worth) -> Page:
 
 def headline(worth: Worth) -> str:
     """Say what helps most: a sensor, data or a limit."""
-    reached, now = f"reaches {worth.goal} of every parameter", worth.ratio(worth.std)
+    reached = f"reaches {worth.goal} of every parameter"
+    now = worth.ratio(worth.std)
     if np.isinf(now):
         reached = f"does not determine {worth.worst(worth.std)} alone"
     elif now > 1.0:
         reached = f"misses {worth.goal} of {worth.worst(worth.std)} by a factor of {now:.2g}"
-    helps = []
+    helps = ", ".join(_helps(worth)) or "none of these sensors"
+    return f"{capitalised(worth.source)} {reached}. What lowers σ: {helps}."
+
+
+def _helps(worth: Worth) -> Iterator[str]:
+    """The best sensor, the best added one and the dearest limit, each with the change of σ."""
     for added in (False, True):
         rows = [each for each in worth.single if each.is_added == added]
-        if rows:
-            best = min(rows, key=lambda each: worth.ratio(each.improved))
+        best = min(rows, key=lambda each: worth.ratio(each.improved), default=None)
+        if best is not None and change(worth, best.improved) != "same":
             what = best.name if added else f"half the noise of {best.name}"
-            helps.append(f"{what} ({change(worth, best.improved).partition(' (')[0]})")
+            yield f"{what} ({change(worth, best.improved).partition(' (')[0]})"
     if worth.prices:
         price = worth.dearest[0]
-        helps.append(f"{price_name(price)} ({percent(price.change)})")
-    helps = [each for each in helps if "(same)" not in each] or ["none of these sensors"]
-    return f"{capitalised(worth.source)} {reached}. What lowers σ: {', '.join(helps)}."
+        yield f"{price_name(price)} ({percent(price.change)})"
 
 
 def worth_parts(worth: Worth | None, *, detail: bool = False) -> Sequence[Part]:

@@ -51,7 +51,7 @@ from mjfim.output.words import (
     when_learnt,
 )
 from mjfim.records.design import Design, LimitUsage
-from mjfim.records.trajectory import Labels, Trajectory
+from mjfim.records.trajectory import Labels, Trajectory, with_unit
 from mjfim.records.worth import SensorWorth, Worth
 
 # Number of turning points above which a curve would be a solid area; its envelope is drawn instead.
@@ -302,11 +302,11 @@ def _history_marks(iterations: Array, values: Array, begin: str) -> list[Mark]:
 
 def accuracy(design: Design, labels: Labels) -> Picture:
     """Show the predicted standard deviations of both trajectories in percent, and wanted ones."""
-    wanted, combined = list(design.wanted), design.combined
-    names = [labels.parameter(j) for j in wanted] + [each.expression for each in combined]
+    wanted, combined, rows = list(design.wanted), design.combined, design.rows
+    names = [with_unit(each.name, each.unit) for each in rows]
     sizes = np.array([*design.shares[wanted], *(abs(each.value) or np.nan for each in combined)])
-    before = np.array([*design.initial.std[wanted], *(each.std_initial for each in combined)])
-    after = np.array([*design.stated_std[wanted], *(each.std_final for each in combined)])
+    before = np.array([each.further["std_initial"] for each in rows])
+    after = np.array([each.std for each in rows])
     goal = np.array([*labels.wanted[wanted], *[np.inf] * len(combined)])
     first = Accuracies(before, INITIAL, INITIAL, size=10.0, hollow=True)
     panel = accuracy_panel(names, sizes, [first, Accuracies(after, DESIGNED, DESIGNED)], goal)
@@ -330,29 +330,28 @@ def accuracy(design: Design, labels: Labels) -> Picture:
 def accuracy_over_time(design: Design, labels: Labels) -> Picture:
     """Show the standard deviation of each parameter, by the measurements up to each time."""
     asked = [j for j in design.wanted if np.isfinite(design.stated_std[j] / design.shares[j])]
-    targets = design.targets
-    seconds = design.seconds_to(targets)
-    last_first = sorted(asked, key=lambda j: (-seconds[j], -design.stated_std[j] / design.sizes[j]))
-    shown = sorted(last_first[: len(SERIES)])
-    which = "parameters, those that are known last"
-    remark = sigma_remark(design.inflation, design.parameters)
-    begin = design.trajectory.t[0]
-    panel = accuracy_over_time_panel(
-        [
-            (design.initial.trajectory.t, design.initial.std_over_time),
-            (design.trajectory.t, design.std_over_time),
-        ],
-        labels.parameters,
-        design.sizes,
-        targets,
-        begin + seconds,
-        shown,
-        is_stated=bool(np.isfinite(labels.wanted).any()),
-    )
+    seconds = design.seconds_to(design.targets)
+    asked.sort(key=lambda j: (-seconds[j], -design.stated_std[j] / design.sizes[j]))
+    shown = sorted(asked[: len(SERIES)])
     return Picture(
         title=when_learnt(design, shorten).removesuffix(".") or "Accuracy over time",
-        panels=[panel],
-        note=f"Beside the names: σ at the end. {remark}{share_note(shown, asked, which)}",
+        panels=[
+            accuracy_over_time_panel(
+                [
+                    (design.initial.trajectory.t, design.initial.std_over_time),
+                    (design.trajectory.t, design.std_over_time),
+                ],
+                labels.parameters,
+                design.sizes,
+                design.targets,
+                design.trajectory.t[0] + seconds,
+                shown,
+                is_stated=bool(np.isfinite(labels.wanted).any()),
+            )
+        ],
+        note="Beside the names: σ at the end. "
+        + sigma_remark(design.inflation, design.parameters)
+        + share_note(shown, asked, "parameters, those that are known last"),
         heights=[3.4],
         keys=[line([], [], "muted", label="initial motion", **INITIAL_LOOK)],
     )

@@ -6,7 +6,7 @@ import io
 import os
 import textwrap
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import lru_cache
 from pathlib import Path
@@ -313,10 +313,22 @@ def _name_ticks(axis: DrawnAxis, stated: Axis, room: float) -> None:
     axis.grid(False)
 
 
+def _draw_points(axes: Axes, mark: Mark, stroke: Mapping[str, Any]) -> None:
+    """Draw a line or dots."""
+    axes.plot(
+        mark.x,
+        mark.y,
+        **{**stroke, "linestyle": "" if mark.kind == "dots" else mark.dash},
+        marker=mark.symbol or None,
+        markersize=mark.size,
+        markerfacecolor="white" if mark.hollow else stroke["color"],
+        markeredgewidth=mark.width if mark.symbol in ("|", "_", "x") else 1.0,
+    )
+
+
 def _draw_mark(axes: Axes, mark: Mark) -> None:
-    colour = ROLES[mark.role]
     stroke: dict[str, Any] = {
-        "color": colour,
+        "color": ROLES[mark.role],
         "alpha": mark.opacity,
         "zorder": mark.front,
         "linewidth": mark.width,
@@ -324,21 +336,13 @@ def _draw_mark(axes: Axes, mark: Mark) -> None:
     }
     match mark.kind:
         case "line" | "dots":
-            axes.plot(
-                mark.x,
-                mark.y,
-                **stroke | ({"linestyle": ""} if mark.kind == "dots" else {}),
-                marker=mark.symbol or None,
-                markersize=mark.size,
-                markerfacecolor="white" if mark.hollow else colour,
-                markeredgewidth=mark.width if mark.symbol in ("|", "_", "x") else 1.0,
-            )
+            _draw_points(axes, mark, stroke)
         case "steps":
             # Stairs take ten times as long, because they are curves for matplotlib.
             held = np.append(mark.y, mark.y[-1:])
             axes.plot(mark.x, held, drawstyle="steps-post", snap=False, **stroke)
         case "intervals":
-            _draw_intervals(axes, mark, colour)
+            _draw_intervals(axes, mark, ROLES[mark.role])
         case "vline":
             axes.axvline(mark.x[0], **stroke)
         case "hline":
@@ -405,6 +409,11 @@ def _draw_cells(axes: Axes, cells: Cells) -> None:
     if cells.scale is not None:
         bar = axes.figure.colorbar(image, ax=axes, shrink=0.8, pad=0.015, aspect=30)
         bar.set_ticks(list(cells.scale[0]), labels=list(cells.scale[1]))
+    _write_cells(axes, cells)
+
+
+def _write_cells(axes: Axes, cells: Cells) -> None:
+    """Write the words of cells, white ones into dark cells."""
     for i, row in enumerate(cells.texts):
         for j, text in enumerate(row):
             is_dark = abs(cells.values[i, j] - cells.middle) > DARK_CELL * cells.reach

@@ -200,7 +200,8 @@ def parameter_intervals(estimate: Estimate, labels: Labels) -> Picture:
 
 def accuracy(estimate: Estimate, labels: Labels) -> Picture:
     """Show predicted, formal and honest σ in percent, and the distance to published values."""
-    names, honest = [labels.parameter(j) for j in range(len(estimate.theta))], estimate.honest_std
+    names = list(map(with_unit, labels.parameters, labels.parameter_units))
+    honest = estimate.honest_std
     std = np.where(np.isnan(honest), np.nan, estimate.std)
     sources = [
         Accuracies(estimate.predicted_std, DESIGNED, "predicted σ", size=12.0, hollow=True),
@@ -210,7 +211,7 @@ def accuracy(estimate: Estimate, labels: Labels) -> Picture:
     ]
     shown = [source for source in sources if np.isfinite(source.std).any()]
     # A share of a value or of a nominal value of 0 says nothing.
-    known = (estimate.theta != 0.0) & (estimate.initial_theta != 0.0) & (estimate.sizes > 0.0)
+    known = (estimate.theta != 0.0) & (estimate.initial_theta != 0.0)
     sizes = np.where(known, estimate.sizes, np.nan)
     note = "Honest σ: a quarter of the width of the 95 % interval."
     if np.isfinite(labels.published).any():
@@ -438,7 +439,12 @@ def _over_time(
         panels.append(Panel(title=label, marks=marks, x=time, y=shown))
 
         errors, remark = _errors(
-            t, y, model, guess, float(sigma[j]), is_prediction=is_prediction, size=size
+            t,
+            y - model,
+            y - guess if is_prediction and guess is not None else None,
+            float(sigma[j]),
+            is_prediction=is_prediction,
+            size=size,
         )
         unit = Axis(label=f"[{split_unit(label)[1] or '–'}]", most=4)
         message = "" if remark else "not measured"
@@ -484,8 +490,7 @@ def _visible_range(values: Array, nominal: Array | None) -> tuple[float, float] 
 
 def _errors(
     t: Array,
-    y: Array,
-    identified: Array,
+    residual: Array,
     nominal: Array | None,
     sigma: float,
     *,
@@ -496,19 +501,17 @@ def _errors(
     marks = [hline(0.0, width=0.8)]
     if np.isfinite(sigma):
         marks.append(hspan(-2.0 * sigma, 2.0 * sigma, opacity=0.8, label="±2σ of the noise"))
-    residual = y - identified
     role = IDENTIFIED if is_prediction else MEASURED
     marks.append(dots(t, residual, role, symbol=".", size=size, front=2.5))
-    if is_prediction and nominal is not None:
-        marks.append(dots(t, y - nominal, NOMINAL, symbol=".", size=0.7 * size))
-    known = residual[np.isfinite(residual)]
-    if not known.size:
+    if nominal is not None:
+        marks.append(dots(t, nominal, NOMINAL, symbol=".", size=0.7 * size))
+    shares = residual[np.isfinite(residual)] / sigma
+    if not shares.size:
         return marks, ""
     words = "error" if is_prediction else "residual"
     if np.isfinite(sigma):
-        relative_rms = np.sqrt(np.mean(known**2)) / sigma
-        outside = 100.0 * np.mean(np.abs(known) > 2.0 * sigma)
-        words += f": rms / σ = {relative_rms:.2f},  {outside:.1f} % outside"
+        rms = np.sqrt(np.mean(shares**2))
+        words += f": rms / σ = {rms:.2f},  {100.0 * np.mean(np.abs(shares) > 2.0):.1f} % outside"
     return marks, words
 
 
@@ -552,15 +555,14 @@ def _spectrum_panel(estimate: Estimate, column: int, name: str) -> Panel:
     if not freedom or not (density > 0.0).any():
         return Panel(title=name, remark=remark, message="not measured")
     # Quantiles of a chi-squared distribution; scipy.stats takes long to import.
-    quantiles = 2.0 * scipy.special.gammaincinv(0.5 * freedom, np.array([0.975, 0.025]))
+    quantiles = 2.0 * scipy.special.gammaincinv(0.5 * freedom, [0.975, 0.025])
     low, high = freedom / quantiles
-    label = "its 95 % confidence band"
     return Panel(
         title=name,
         remark=remark,
         marks=[
             line(f, density, MEASURED, label="residual"),
-            area(f, low * density, high * density, MEASURED, label=label),
+            area(f, low * density, high * density, MEASURED, label="its 95 % confidence band"),
             hline(1.0, width=0.8, label="white noise of the assumed σ"),
         ],
         x=Axis(label="frequency [Hz]", log=True),

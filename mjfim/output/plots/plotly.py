@@ -155,18 +155,23 @@ def _points(mark: Mark, colour: str, limit: int) -> Plotly:
         drawn["line"] = look | ({"shape": "hv"} if mark.kind == "steps" else {})
     if mark.symbol:
         parts.append("markers")
-        symbol = SYMBOLS[mark.symbol]
-        if mark.hollow and not symbol.endswith("open"):
-            symbol += "-open"
-        width = {"width": PIXELS * mark.width, "color": colour}
-        size = max(PIXELS * mark.size * (0.6 if mark.symbol == "." else 1.0), 3.0)
-        drawn["marker"] = {"color": colour, "size": size, "symbol": symbol}
-        if symbol.startswith("line"):
-            drawn["marker"]["line"] = width
+        drawn["marker"] = _marker(mark, colour)
     if mark.texts:
         drawn["text"] = [escape(mark.texts[i]) for i in kept]
         drawn["hoverinfo"] = "text+name"
     return {**drawn, "mode": "+".join(parts)}
+
+
+def _marker(mark: Mark, colour: str) -> Plotly:
+    """The look of dots."""
+    symbol = SYMBOLS[mark.symbol]
+    if mark.hollow and not symbol.endswith("open"):
+        symbol += "-open"
+    size = max(PIXELS * mark.size * (0.6 if mark.symbol == "." else 1.0), 3.0)
+    marker: Plotly = {"color": colour, "size": size, "symbol": symbol}
+    if symbol.startswith("line"):
+        marker["line"] = {"width": PIXELS * mark.width, "color": colour}
+    return marker
 
 
 def _heatmap(cells: Cells) -> Plotly:

@@ -68,7 +68,8 @@ from mjfim.output.words import (
     squared_unit,
     without_zeros,
 )
-from mjfim.records.check import CONFOUNDED_CORRELATION, Check
+from mjfim.records.base import ParameterValue
+from mjfim.records.check import CONFOUNDED_CORRELATION, Check, ParameterCheck
 from mjfim.records.rehearsal import MAX_PATHS, Rehearsal, Separation, Valley
 from mjfim.records.robots import RobotComparison
 from mjfim.records.studies import (
@@ -123,9 +124,10 @@ def check(result: Check) -> Picture:
     """Show predicted and wanted relative standard deviations, and correlations of the estimates."""
     rows = [row for row in result.rows if not row.nuisance]
     combined = result.combined
-    names = [with_unit(row.name, row.unit) for row in rows] + [each.expression for each in combined]
-    std = np.array([*(row.std for row in rows), *(each.std_final for each in combined)])
-    values = np.array([*(row.value for row in rows), *(each.value for each in combined)])
+    both: list[ParameterCheck | ParameterValue] = [*rows, *combined]
+    names = [with_unit(row.name, row.unit) for row in both]
+    std = np.array([row.std for row in both])
+    values = np.array([row.value for row in both])
     sizes = np.array([*(row.size for row in rows), *(abs(each.value) for each in combined)])
     goals = np.array([*(row.wanted for row in rows), *[np.inf] * len(combined)])
     label = f"predicted, {result.source} ({duration(result)})"
@@ -171,38 +173,33 @@ def duration(result: Check) -> str:
 
 def _correlations(result: Check, rows: int) -> Panel:
     """Return the correlation matrix of the estimates as cells, beside rows of bars."""
-    correlation = np.array(result.correlation)
+    # The diagonal is 0, or NaN for a parameter that is not identifiable alone.
+    correlation = result.correlation - np.diag(np.diagonal(result.correlation))
     count = len(correlation)
-    np.fill_diagonal(correlation, np.where(np.isfinite(np.diagonal(correlation)), 0.0, np.nan))
     confounded = np.abs(correlation) > CONFOUNDED_CORRELATION
-    texts = []
-    marks = []
-    if count <= MAX_CORRELATIONS:
-        texts = [
-            [
-                f"{value:+.2f}".replace("-", "−") if value and np.isfinite(value) else ""
-                for value in row
-            ]
-            for row in correlation
-        ]
-    else:
-        up, across = np.nonzero(confounded)
-        marks = [dots(across, up, "white", size=3.0)]
-    sign = "bold" if texts else "dot"
-    far = f"{sign}: beyond ±{CONFOUNDED_CORRELATION:g}, hardly distinguishable"
-    remark = f"correlation (red: positive, blue: negative); {far}"
+    far = f"beyond ±{CONFOUNDED_CORRELATION:g}, hardly distinguishable"
     if np.isnan(correlation).any():
-        remark += "; grey: not identifiable alone"
-    if not texts:
-        remark += "; columns in the order of the rows"
-    cells = Cells(values=correlation, texts=texts, is_bold=confounded)
-    return Panel(
-        cells=cells,
-        marks=marks,
-        x=Axis(ticks=range(count), names=result.wanted) if texts else Axis(ticks=(), names=()),
-        y=blank_rows(rows),
-        remark=remark,
-        place=(0, 1),
+        far += "; grey: not identifiable alone"
+    panel = Panel(y=blank_rows(rows), place=(0, 1))
+    words = "correlation (red: positive, blue: negative)"
+    if count > MAX_CORRELATIONS:
+        up, across = np.nonzero(confounded)
+        return replace(
+            panel,
+            cells=Cells(values=correlation),
+            marks=[dots(across, up, "white", size=3.0)],
+            x=Axis(ticks=(), names=()),
+            remark=f"{words}; dot: {far}; columns in the order of the rows",
+        )
+    texts = [
+        [f"{value:+.2f}".replace("-", "−") if value and np.isfinite(value) else "" for value in row]
+        for row in correlation
+    ]
+    return replace(
+        panel,
+        cells=Cells(values=correlation, texts=texts, is_bold=confounded),
+        x=Axis(ticks=range(count), names=result.wanted),
+        remark=f"{words}; bold: {far}",
     )
 
 
@@ -226,7 +223,7 @@ def valley(found: Valley, motions: Sequence[tuple[str, str]]) -> Picture:
     for k, (each, (name, role)) in enumerate(zip(every, motions, strict=True)):
         panels += [
             replace(panel, role=role, place=(row, k))
-            for row, panel in enumerate(_separation(found, each, name, ends))
+            for row, panel in enumerate(_separation(found, each, name, *ends))
         ]
     moved = found.moved[:MAX_MOVED]
     rows, percent = np.arange(len(moved)), found.percent[:, moved]
@@ -261,7 +258,7 @@ def valley(found: Valley, motions: Sequence[tuple[str, str]]) -> Picture:
 
 
 def _separation(
-    found: Valley, along: Separation, name: str, ends: tuple[float, float]
+    found: Valley, along: Separation, name: str, reach: float, farthest: float
 ) -> tuple[Panel, Panel]:
     """Return the output of two robots about its mean, and their distance, with ends of the axes."""
     curves = [
@@ -274,24 +271,33 @@ def _separation(
     after = "not told apart"
     if np.isfinite(along.seen_after):
         after = f"told apart after {along.seen_after:.3g} s"
-    output = Panel(
-        title=f"{name}: {along.total:.3g} σ apart",
-        marks=[band, *curves],
-        y=Axis(label=f"Δ {found.output}", limits=(-ends[0], ends[0])),
+    return (
+        Panel(
+            title=f"{name}: {along.total:.3g} σ apart",
+            marks=[band, *curves],
+            y=Axis(label=f"Δ {found.output}", limits=(-reach, reach)),
+        ),
+        Panel(
+            title=f"{name}: {after}",
+            marks=[
+                hspan(LEAST_DISTANCE, NORMAL_95, label="too little to tell apart (95 %)"),
+                line(along.t, np.maximum(along.distance, LEAST_DISTANCE), "text"),
+            ],
+            x=Axis(label="time [s]"),
+            y=Axis(label="distance [σ of noise]", limits=(LEAST_DISTANCE, farthest), log=True),
+        ),
     )
-    distance = Panel(
-        title=f"{name}: {after}",
-        marks=[
-            hspan(LEAST_DISTANCE, NORMAL_95, label="too little to tell apart (95 %)"),
-            line(along.t, np.maximum(along.distance, LEAST_DISTANCE), "text"),
-        ],
-        x=Axis(label="time [s]"),
-        y=Axis(label="distance [σ of noise]", limits=(LEAST_DISTANCE, ends[1]), log=True),
-    )
-    return output, distance
 
 
 # ---- comparison of methods
+
+# What stands beside the standard deviations: margins, if there are limits.
+BESIDE_STD = {
+    True: "the smallest margin of all limits, as a share of half of the limit's range, and its "
+    "kind; negative: the limit is violated.",
+    False: "J, which also weighs the effort of the control: without limits, more effort buys a "
+    "smaller σ.",
+}
 
 
 def compare(comparison: Comparison) -> Picture:
@@ -300,7 +306,6 @@ def compare(comparison: Comparison) -> Picture:
         comparison.rows, key=lambda row: (not row.sound, np.nan_to_num(row.cost, nan=np.inf))
     )
     roles = [_method_role(comparison, row) for row in rows]
-    names = [comparison.parameters[j] for j in comparison.wanted]
     methods = row_axis(
         [row.title for row in rows],
         [role if row.sound else "muted" for role, row in zip(roles, rows, strict=True)],
@@ -310,26 +315,17 @@ def compare(comparison: Comparison) -> Picture:
     note = (
         f"{' '.join(others)} Each method had {budget_in_words(comparison)}. "
         "Predicted standard deviations are the best case. Sorted by the cost J, best first. "
+        f"Beside σ: {BESIDE_STD[has_margins]}"
     )
-    if has_margins:
-        note += (
-            "Beside σ: the smallest margin of all limits, as a share of half of the limit's range, "
-            "and its kind; negative: the limit is violated."
-        )
-    else:
-        note += (
-            "Beside σ: J, which also weighs the effort of the control: without limits, more effort "
-            "buys a smaller σ."
-        )
     return Picture(
         title=first.removesuffix("."),
         panels=[
-            _ratios(comparison, rows, names, methods),
+            _ratios(comparison, rows, methods),
             _worst_combinations(comparison, rows, roles, has_margins=has_margins),
         ],
         note=note.strip(),
         heights=[np.clip(1.2 + 0.36 * len(rows), 2.2, 11.0)],
-        widths=[np.clip(0.55 * len(names), 2.2, 9.0), 3.6],
+        widths=[np.clip(0.55 * len(comparison.wanted), 2.2, 9.0), 3.6],
     )
 
 
@@ -339,11 +335,10 @@ def _method_role(comparison: Comparison, row: MethodResult) -> str:
     return OTHER if row in comparison.beating else INITIAL
 
 
-def _ratios(
-    comparison: Comparison, rows: Sequence[MethodResult], names: list[str], methods: Axis
-) -> Panel:
+def _ratios(comparison: Comparison, rows: Sequence[MethodResult], methods: Axis) -> Panel:
     """Return standard deviations over the design's, or over the scales if the design has none."""
     wanted = list(comparison.wanted)
+    names = [comparison.parameters[j] for j in wanted]
     std = np.array([row.std[wanted] for row in rows]).reshape(len(rows), len(wanted))
     design = comparison.design
     reference, title = comparison.scale[wanted], "σ of each parameter / its scale"
@@ -879,13 +874,10 @@ def _estimate_over_rounds(
 ) -> Panel:
     """Return the estimates of parameter j, with the true value if it is known."""
     theta = np.array([r.estimate.theta[j] for r in result.rounds])
-    std = np.array([r.attained[j] for r in result.rounds])
-    bar = np.where(np.isfinite(std), std, 0.0)
+    std = finite_or_nan(np.array([r.attained[j] for r in result.rounds]))
     marks = [dots(numbers, theta, IDENTIFIED)]
     for factor, width in ((1.0, 2.4), (2.0, 0.9)):
-        ends = np.column_stack(
-            [theta - factor * bar, theta + factor * bar, np.full(len(bar), np.nan)]
-        )
+        ends = theta[:, None] + np.outer(factor * std, [-1.0, 1.0, np.nan])
         marks.append(line(np.repeat(numbers, 3), ends.ravel(), IDENTIFIED, width=width))
         if np.isfinite(std[-1]):
             marks.append(hspan(ends[-1, 0], ends[-1, 1], IDENTIFIED, opacity=0.07))

@@ -289,7 +289,7 @@ def _iterate_plots(design: Design, labels: Labels) -> list[IteratePlot]:
         for k, title in enumerate(titles):
             start = initial.t[: len(first)], first[:, k]
             curves = [
-                (np.asarray(t[: len(each)], dtype=np.float64), np.asarray(each[:, k]))
+                (np.asarray(t[: len(each)]), each[:, k])
                 for t, each in zip(motions.t, values, strict=True)
             ]
             every = [line(*pair, "text") for pair in (start, *curves)]
@@ -382,7 +382,8 @@ def open_recording(
     Yields:
         The stream.
     """
-    left, summary = robots, entity_path(("summary",))
+    left = robots
+    summary = entity_path(("summary",))
     if text:
         below = rrb.TextDocumentView(origin=summary, name="summary")
         left = rrb.Vertical(robots, below, row_shares=ROBOTS_TO_TEXT)
@@ -478,11 +479,19 @@ def _robots(
         return separate
     # The camera of a view that is opened later, while a body flies, would begin in a wrong place.
     still = place_camera(model, motions, views=1, aspect=aspect, follow=False)
-    pale: dict[str, rrb.Visualizer] = {}
-    for name in names[:-1]:
-        pale |= pale_shapes(model, ("robots", name), (roles or {}).get(name, name))
-    overlay = robot_views(model, still, {"overlay": ("robots",)}, overrides=pale)[0]
+    pale = _pale_robots(model, names[:-1], roles or {})
+    (overlay,) = robot_views(model, still, {"overlay": ("robots",)}, overrides=pale)
     return rrb.Tabs(separate, overlay, active_tab=0)
+
+
+def _pale_robots(
+    model: mujoco.MjModel, names: Sequence[str], roles: Mapping[str, str]
+) -> dict[str, rrb.Visualizer]:
+    """Return the translucent look of robots, by the paths of their shapes."""
+    pale: dict[str, rrb.Visualizer] = {}
+    for name in names:
+        pale |= pale_shapes(model, ("robots", name), roles.get(name, name))
+    return pale
 
 
 def _log_robots(

@@ -17,10 +17,9 @@ from mjfim.experiment.arguments import checked
 from mjfim.experiment.schema import ExperimentLike
 from mjfim.experiment.system import System, labels_of_model
 from mjfim.output.archive import shown_positions
-from mjfim.output.live import live_system
+from mjfim.output.live import design_stage, design_text, live_system, progress_line
 from mjfim.output.page import DESIGNED, IDENTIFIED, INITIAL, MEASURED, NOMINAL, OTHER
 from mjfim.output.panels import line
-from mjfim.output.progress_text import design_stage, design_text, progress_line
 from mjfim.output.rerun.camera import Camera, place_camera
 from mjfim.output.rerun.documents import (
     ASPECT_WITH_TEXT,
@@ -146,8 +145,8 @@ class LiveShow:
             self._show_best()
 
     def _take(self, event: Event) -> None:
+        self._rec.set_time(TIMELINE, sequence=self._events)
         self._events += 1
-        self._rec.set_time(TIMELINE, sequence=self._events - 1)
         result = event.result if isinstance(event, StudyEvent) else None
         kind = Watch if isinstance(result, Watch) else type(event)
         if kind not in self._kinds:
@@ -161,15 +160,19 @@ class LiveShow:
             self._add("squares", event.phase, _logarithm(event.cost))
             self._add("step", event.phase, _logarithm(event.step))
         elif isinstance(result, Watch):
-            self._rec.set_time(STREAM_TIMELINE, duration=result.seconds)
-            self._add("accuracy", WANTED, 0.0)
-            for j in result.asked.tolist():
-                share = float(result.std[j] / result.wanted[j])
-                self._add("accuracy", result.parameters[j], _logarithm(share))
-        elif event.count is not None:
-            share = (event.index + event.share) / max(event.count, 1)
+            self._add_accuracy(result)
+        elif event.count:
+            share = (event.index + event.share) / event.count
             self._add("share", event.study, 100.0 * share)
         self._show_text(_text_of(event, self._best))
+
+    def _add_accuracy(self, watch: Watch) -> None:
+        """Add σ over its wanted value of each parameter, on the timeline of the stream."""
+        self._rec.set_time(STREAM_TIMELINE, duration=watch.seconds)
+        self._add("accuracy", WANTED, 0.0)
+        for j in watch.asked.tolist():
+            share = float(watch.std[j] / watch.wanted[j])
+            self._add("accuracy", watch.parameters[j], _logarithm(share))
 
     def end(self) -> None:
         """Show the best motion, and close the connection."""
@@ -230,10 +233,7 @@ class LiveShow:
             return
         self._is_shown = True
         self._rec.set_time(TIMELINE, sequence=self._events - 1)
-        motion = best.row.motion
-        t, qpos, ctrl = (
-            np.asarray(each, dtype=np.float64) for each in (motion.t, motion.qpos, motion.ctrl)
-        )
+        t, qpos, ctrl = best.row.motion
         rows = evenly_spread_indices(len(t), MOTION_SAMPLES)
         if not np.isfinite(qpos[rows]).all():
             return
@@ -289,17 +289,19 @@ class LiveShow:
             (robot,) = robot_views(self._model, self._camera, {"best iterate so far": ROBOT})
             over_events = rrb.Grid(*plots, grid_columns=2)
             left = rrb.Vertical(robot, over_events, progress, row_shares=LEFT_HEIGHTS)
-            tabs = [
-                tab
-                for group, planes in self._planes.items()
-                for tab in grid_tabs(group, [plane.view() for plane in planes])
-            ]
-            layout = rrb.Horizontal(
-                left, rrb.Tabs(*tabs, active_tab=0), column_shares=LEFT_TO_RIGHT
-            )
+            layout = rrb.Horizontal(left, self._curves_of_best(), column_shares=LEFT_TO_RIGHT)
         timeline = STREAM_TIMELINE if Watch in self._kinds else TIMELINE
         panel = rrb.TimePanel(state="collapsed", timeline=timeline, play_state="following")
         self._rec.send_blueprint(blueprint_of(layout, panel), make_active=True, make_default=True)
+
+    def _curves_of_best(self) -> rrb.Tabs:
+        """Return tabs with the positions and the controls of the best motion."""
+        tabs = [
+            tab
+            for group, planes in self._planes.items()
+            for tab in grid_tabs(group, [plane.view() for plane in planes])
+        ]
+        return rrb.Tabs(*tabs, active_tab=0)
 
 
 def _rank(row: HistoryRow) -> tuple[float, bool, float]:

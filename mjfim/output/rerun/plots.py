@@ -128,16 +128,16 @@ def with_curves(panel: Panel) -> Panel:
 
 def _log_mark(rec: rr.RecordingStream, parts: EntityParts, mark: Mark, ends: Array) -> None:
     """Log one mark, of a strip its edges; those that are level reach through the whole time."""
-    x, y = mark.x[: len(mark.y)], mark.y
-    if mark.kind == "hline" or (mark.kind == "hspan" and mark.label):
-        for k, level in enumerate((mark.y, mark.other) if mark.other is not None else (mark.y,)):
-            look = replace(mark, width=1.0, label=mark.label or "limit")
-            _send(rec, (*parts[:-1], f"{parts[-1]} {k}"), ends, np.repeat(level, 2), look)
-    elif mark.kind == "area" and mark.label:
-        for k, edge in enumerate((mark.y, mark.other)):
-            _send(rec, (*parts[:-1], f"{parts[-1]} {k}"), x, np.asarray(edge), mark)
-    elif mark.kind in ("line", "steps", "dots"):
-        _send(rec, parts, x, y, mark)
+    x = mark.x[: len(mark.y)]
+    if mark.kind in ("line", "steps", "dots"):
+        _send(rec, parts, x, mark.y, mark)
+    if mark.kind == "hline" or (mark.kind in ("hspan", "area") and mark.label):
+        edges = [mark.y] if mark.other is None else [mark.y, mark.other]
+        if mark.kind != "area":
+            x, edges = ends, [np.repeat(level, 2) for level in edges]
+            mark = replace(mark, width=1.0, label=mark.label or "limit")
+        for k, edge in enumerate(edges):
+            _send(rec, (*parts[:-1], f"{parts[-1]} {k}"), x, edge, mark)
 
 
 def _send(rec: rr.RecordingStream, parts: EntityParts, t: Array, y: Array, mark: Mark) -> None:
