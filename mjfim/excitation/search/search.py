@@ -660,13 +660,13 @@ class Search:
                 for each in waiting
             ]
             before, waiting = waiting, []
-            for outcome in carry_out(self.executor, move_in_worker, moves, self.budget):
-                begun = before[outcome.index]
-                if outcome.is_lost:
+            for index, ended in carry_out(self.executor, move_in_worker, moves, self.budget):
+                begun = before[index]
+                if not ended:
                     # What was lost with its worker is done here.
-                    found = yield from Climb(self.grounds, moves[outcome.index]).run()
+                    found = yield from Climb(self.grounds, moves[index]).run()
                 else:
-                    found = outcome.result
+                    found = ended[0]
                     self.remote_steps += found.steps - begun.steps
                     for row in found.history[len(begun.history) :]:
                         if not self.budget.stop.requested:
@@ -674,13 +674,13 @@ class Search:
                 results[found.name] = found
                 has_moved = len(found.history) > len(begun.history)
                 is_over = found.is_judged or found.has_left or found.is_held_up or found.status
-                if moves[outcome.index].may_continue and has_moved and not is_over:
+                if moves[index].may_continue and has_moved and not is_over:
                     waiting.append(found)
             if self.budget.exhausted is not None:
                 break
 
-        ended = [results[each.name] for each in candidates if results[each.name] is not each]
-        return [self._ended(each, rungs[-1], is_last) for each in ended]
+        moved = [results[each.name] for each in candidates if results[each.name] is not each]
+        return [self._ended(each, rungs[-1], is_last) for each in moved]
 
     def _ended(self, found: Candidate, rung: Rung, is_last: bool) -> Candidate:
         """A candidate after its last move, judged on the stated plant."""
