@@ -23,9 +23,8 @@ from mjfim.excitation.search.interior_problem import InteriorPoint, InteriorProb
 from mjfim.excitation.search.levels import DescentLevel, bandwidth_basis, regulator_for
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.initial import independent_curves
-from mjfim.optimize.directions import LBFGS, MetricDescent
+from mjfim.optimize.directions import LBFGS, MetricDescent, StructuredBFGS
 from mjfim.optimize.projection_operator import Direction, Iterate, Regulator, optimize
-from mjfim.optimize.structured_bfgs import StructuredBFGS
 from mjfim.parallel.budget import Budget
 from mjfim.records.design import Status
 
