@@ -17,8 +17,8 @@ import scipy
 from mjfim.arrays import Array, record
 from mjfim.errors import SimulationDivergedError
 from mjfim.excitation.evaluation import UNSTABLE_GROWTH
+from mjfim.excitation.limits.limits import ReleaseSpace
 from mjfim.excitation.objective import DIVERGED, DesignPoint
-from mjfim.excitation.release_space import ReleaseSpace
 from mjfim.excitation.search.climb import Candidate, row_of
 from mjfim.excitation.search.inside import LimitedCost
 from mjfim.excitation.search.levels import DescentLevel

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from functools import cached_property
@@ -12,9 +11,8 @@ import numpy as np
 
 from mjfim.arrays import Array, record
 from mjfim.errors import SimulationDivergedError
-from mjfim.excitation.limits.limits import Limit, limits_of, limits_of_model
+from mjfim.excitation.limits.limits import Limit, ReleaseSpace, limits_of, limits_of_model
 from mjfim.excitation.objective import DesignProblem, RunningCost
-from mjfim.excitation.release_space import ReleaseSpace
 from mjfim.excitation.task_parts import (
     ParameterSamples,
     contrast_of,
@@ -601,15 +599,16 @@ class DesignTask:
         # A stop acts inside of a limit that the file states wider than the MJCF.
         model = self.system.model
         own = {(each.kind, each.name): each for each in limits_of_model(model)}
-        named = defaultdict(set)
+        inside = set()
         for limit in self.limits:
-            stop = own.get((limit.kind, limit.name), limit)
+            key = limit.kind, limit.name
+            stop = own.get(key, limit)
             if stop.lower <= limit.lower and limit.upper <= stop.upper:
-                named[limit.kind].add(limit.name)
+                inside.add(key)
 
-        def chosen(names: tuple[str, ...], kind: str) -> tuple[int, ...]:
+        def chosen(names: Sequence[str], kind: str) -> tuple[int, ...]:
             """Numbers of the elements that have a limit of a kind."""
-            return tuple(i for i, name in enumerate(names) if name in named[kind])
+            return tuple(i for i, name in enumerate(names) if (kind, name) in inside)
 
         tendons = unique_names(model, "tendon")
         return Relaxation(
