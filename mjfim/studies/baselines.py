@@ -18,8 +18,8 @@ import scipy.signal
 from mjfim.arrays import Array, record
 from mjfim.excitation.design import consume
 from mjfim.excitation.initial_controls import series_of
-from mjfim.excitation.search.inside import LimitedCost, largest_share
-from mjfim.excitation.search.levels import DescentLevel, bandwidth_basis
+from mjfim.excitation.search.inside import largest_share
+from mjfim.excitation.search.levels import DescentLevel
 from mjfim.excitation.search.search import Search
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
@@ -285,12 +285,12 @@ def _search_at_random(
     counts: Numbers that all actuators share, and those of each actuator.
     """
     task = stated.relaxed() if stated.is_limited else stated
-    cost = LimitedCost(level=DescentLevel(task, search.combinations))
+    level = DescentLevel(task, search.combinations)
     rng = search.generator()
-    settings = _settings(cost)
+    settings = _settings(level)
     count = 1 + counts[0] + counts[1] * settings.nu
-    basis, window = bandwidth_basis(task, task.t), task.fade(task.samples)
-    bounds = cost.level.constraints.control.bounds
+    basis, window = task.bandwidth_basis(task.t), task.fade(task.samples)
+    bounds = level.constraints.control.bounds
     is_bounded = bool(np.isfinite(bounds.lower).all())
     largest = LARGEST_BOUNDED_SCALE if is_bounded else LARGEST_UNBOUNDED_SCALE
     has_weights = bool(task.control_weight.any() or task.tracking.any()) or not task.is_limited
@@ -311,15 +311,15 @@ def _search_at_random(
             deviation = basis @ np.linalg.lstsq(basis, deviation)[0]
         scale: float | None = 1.0
         if task.is_limited:
-            scale = largest_share(partial(_keeps_share, cost, deviation), budget)
+            scale = largest_share(partial(_keeps_share, level, deviation), budget)
         if scale is None:
             continue
         if has_weights:
             scale *= SMALLEST_WEIGHTED_SCALE ** (1.0 - numbers[0])
         control = task.centre + scale * deviation
-        values = cost.level.values(control)
-        is_inside = values is not None and cost.level.constraints.is_feasible(values)
-        point = cost.point_along(values) if is_inside or not task.is_limited else None
+        values = level.values(control)
+        is_inside = values is not None and level.constraints.is_feasible(values)
+        point = level.point_along(values) if is_inside or not task.is_limited else None
         J = np.inf if point is None else point.cost
 
         # Widen the local search after a success, narrow it after a failure.
@@ -331,18 +331,18 @@ def _search_at_random(
     return replace(found, steps=task.plant.engine_steps)
 
 
-def _keeps_share(cost: LimitedCost, deviation: Array, share: float) -> bool:
+def _keeps_share(level: DescentLevel, deviation: Array, share: float) -> bool:
     """Check whether a share of a deviation from the centre keeps the limits."""
-    return cost.nearly_keeps(cost.level.task.centre + share * deviation)
+    return level.nearly_keeps(level.task.centre + share * deviation)
 
 
-def _settings(cost: LimitedCost) -> ExcitationSettings:
+def _settings(level: DescentLevel) -> ExcitationSettings:
     """Settings of the excitations of an experiment."""
-    task = cost.level.task
+    task = level.task
     experiment = task.experiment
     bandwidth = experiment.limits.bandwidth
     fastest = min(bandwidth or np.inf, 0.25 * experiment.rate, MAX_CYCLES / task.horizon)
-    is_smooth = cost.level.constraints.rate is not None or bandwidth is not None
+    is_smooth = level.constraints.rate is not None or bandwidth is not None
     return ExcitationSettings(
         t=task.t,
         horizon=task.horizon,

@@ -25,7 +25,7 @@ from mjfim.excitation.limits.verification import (
     require_feasible_start,
     verify,
 )
-from mjfim.excitation.search.inside import InsideSearch, LimitedCost
+from mjfim.excitation.search.inside import InsideSearch
 from mjfim.excitation.search.levels import DescentLevel
 from mjfim.excitation.task import DesignTask
 from mjfim.excitation.task_parts import require_controls
@@ -328,8 +328,7 @@ class MethodEvaluation:
         # A control that violates a limit of the unmodified model is made smaller.
         centre = self.task.centre
         relaxed = DescentLevel(self.task.relaxed(), self.stage.basis)
-        search = InsideSearch(LimitedCost(level=relaxed), 0)
-        inside = search.largest(centre, control - centre, Budget())
+        inside = InsideSearch(relaxed, 0).largest(centre, control - centre, Budget())
         if inside is None:
             return evaluated
         remarks = filter(None, [found.note, f"shrunk to {100.0 * inside.share:.3g} %"])
