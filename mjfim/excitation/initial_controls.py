@@ -10,7 +10,6 @@ import numpy as np
 from mjfim.arrays import Array
 from mjfim.errors import ExperimentError
 from mjfim.excitation.search.climb import Candidate
-from mjfim.excitation.search.levels import boundary_splines
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.initial import fourier_basis, independent_curves
 from mjfim.experiment.packing import opened
@@ -151,7 +150,7 @@ def series_of(
     def curves_of(frequency: float) -> Array:
         """(N, M) curves of a base frequency or of a bandwidth [Hz]."""
         if harmonics is None:
-            return independent_curves(boundary_splines(task, task.t, frequency))
+            return independent_curves(task.boundary_splines(task.t, frequency))
         return _waves(task, frequency, harmonics)
 
     if harmonics is None:

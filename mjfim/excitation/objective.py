@@ -395,19 +395,19 @@ def extend(full: Bilinear, a: Array, b: Array, a_psi: Array) -> Expansion:
     """
     N, nx, nu = full.B.shape
     p = a_psi.shape[2]
-    A = np.zeros((N, nx * (1 + p), nx * (1 + p)))
-    B = np.zeros((N, nx * (1 + p), nu))
-    A[:, :nx, :nx] = full.A
-    B[:, :nx] = full.B
+    # (N, p, nx, nx+nu) derivatives of the next psi by the state and the control.
+    mixed = np.transpose(full.F_mixed, (1, 0, 3, 2))
 
-    for j in range(p):
-        # (N, nx, nx+nu) derivative of the next psi_j by the state and the control.
-        mixed = np.swapaxes(full.F_mixed[j], 1, 2)
+    states = 1 + p
+    A = np.zeros((N, states, nx, states, nx))
+    A[:, range(states), :, range(states)] = full.A
+    A[:, 1:, :, 0] = mixed[..., :nx]
+    B = np.concatenate([full.B[:, None], mixed[..., nx:]], axis=1)
 
-        psi_j = slice(nx * (1 + j), nx * (2 + j))
-        A[:, psi_j, :nx] = mixed[:, :, :nx]
-        A[:, psi_j, psi_j] = full.A
-        B[:, psi_j] = mixed[:, :, nx:]
-
-    stacked = np.swapaxes(a_psi, 1, 2).reshape(N + 1, nx * p)
-    return Expansion(A=A, B=B, a=np.concatenate([a, stacked], axis=1), b=np.array(b))
+    size = states * nx
+    return Expansion(
+        A=A.reshape(N, size, size),
+        B=B.reshape(N, size, nu),
+        a=np.concatenate([a, np.swapaxes(a_psi, 1, 2).reshape(N + 1, nx * p)], axis=1),
+        b=np.array(b),
+    )

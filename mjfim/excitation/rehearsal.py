@@ -633,7 +633,8 @@ class _RobotPlayer:
 
         The controls keep the values that brake it most at the end.
         """
-        bounds, direction = self.constraints.control.bounds, float(np.sign(end.qvel[dof]))
+        bounds = self.constraints.control.bounds
+        direction = np.sign(end.qvel[dof])
         data = mujoco.MjData(model)
 
         def begin(ctrl: Array) -> float:
@@ -641,17 +642,19 @@ class _RobotPlayer:
             mujoco.mj_copyData(data, model, end)
             data.ctrl[:] = ctrl
             mujoco.mj_forward(model, data)
-            return direction * float(data.qacc[dof])
+            return float(direction * data.qacc[dof])
 
         best = 0.5 * (bounds.lower + bounds.upper)
-        for k in range(len(best)):
-            chosen = np.arange(len(best)) == k
-            sides = [np.where(chosen, bound, best) for bound in (bounds.lower, bounds.upper)]
-            best = min(sides, key=begin)
+        for chosen in np.eye(len(best), dtype=bool):
+            best = min(
+                np.where(chosen, bounds.lower, best),
+                np.where(chosen, bounds.upper, best),
+                key=begin,
+            )
         begin(best)
         for _ in range(len(self.ctrl) * self.steps_per_row):
             if data.qvel[dof] * direction <= 0.0:
-                return False
+                break
             mujoco.mj_step(model, data)
             if not limit.lower <= data.qpos[limit.index] <= limit.upper:
                 return True

@@ -17,10 +17,9 @@ import scipy
 from mjfim.arrays import Array, record
 from mjfim.errors import SimulationDivergedError
 from mjfim.excitation.evaluation import UNSTABLE_GROWTH
+from mjfim.excitation.limits.limits import ReleaseSpace
 from mjfim.excitation.objective import DIVERGED, DesignPoint
-from mjfim.excitation.release_space import ReleaseSpace
 from mjfim.excitation.search.climb import Candidate, row_of
-from mjfim.excitation.search.inside import LimitedCost
 from mjfim.excitation.search.levels import DescentLevel
 from mjfim.excitation.task import DesignTask
 from mjfim.excitation.task_parts import Known
@@ -453,7 +452,7 @@ def design_release(
     point, task = best.point, stage.task
     # The stated release stays where no better one within the limits was found.
     if first.cost < point.cost and first.trajectory is not None:
-        relaxed = LimitedCost(level=DescentLevel(task.relaxed(), stage.basis))
+        relaxed = DescentLevel(task.relaxed(), stage.basis)
         if not task.is_limited or relaxed.keeps(first.trajectory.ctrl):
             point = first
     return winner, point, rows, tuple(space.edges(best.shares))

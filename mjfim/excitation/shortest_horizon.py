@@ -140,17 +140,32 @@ def smallest_feasible(
         else:
             infeasible = following
 
-        if feasible is not None and infeasible is not None:
+        if feasible is None or infeasible is None:
+            following = _next_outside(value, following, len(known), largest, grid)
+        else:
             width = tolerance(feasible)
             is_open = feasible - infeasible > width
             following = _next_inside(known, infeasible, feasible, width, grid) if is_open else None
-        elif feasible is not None:
-            smaller = min(feasible * _step_factor(value, len(known)), feasible - 1)
-            following = grid.round_down(smaller) if feasible > grid.minimum else None
-        else:
-            larger = grid.round_up(max(following * _step_factor(value, len(known)), following + 1))
-            following = min(larger, largest) if following < largest else None
     return feasible, infeasible
+
+
+def _next_outside(
+    ratio: float, samples: int, evaluations: int, largest: int, grid: SampleGrid
+) -> int | None:
+    """Next number of samples while one end of the bracket is open; None where there is none.
+
+    Args:
+        ratio: Ratio at the last number of samples.
+        samples: This number.
+        evaluations: Number of evaluations so far.
+        largest: Largest number of samples, on the grid.
+        grid: Numbers that are allowed.
+    """
+    changed = samples * _step_factor(ratio, evaluations)
+    if ratio <= 1.0:
+        return grid.round_down(min(changed, samples - 1)) if samples > grid.minimum else None
+    larger = grid.round_up(max(changed, samples + 1))
+    return min(larger, largest) if samples < largest else None
 
 
 def _step_factor(ratio: float, evaluations: int) -> float:

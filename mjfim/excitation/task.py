@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from functools import cached_property
@@ -11,10 +10,9 @@ from functools import cached_property
 import numpy as np
 
 from mjfim.arrays import Array, record
-from mjfim.errors import SimulationDivergedError
-from mjfim.excitation.limits.limits import Limit, limits_of, limits_of_model
+from mjfim.errors import ExperimentError, SimulationDivergedError
+from mjfim.excitation.limits.limits import Limit, ReleaseSpace, limits_of, limits_of_model
 from mjfim.excitation.objective import DesignProblem, RunningCost
-from mjfim.excitation.release_space import ReleaseSpace
 from mjfim.excitation.task_parts import (
     Known,
     ParameterSamples,
@@ -29,7 +27,7 @@ from mjfim.excitation.task_parts import (
     stated_control,
     tracking_weights_of,
 )
-from mjfim.experiment.initial import keyframe, multisine
+from mjfim.experiment.initial import keyframe, multisine, spline_basis
 from mjfim.experiment.packing import opened
 from mjfim.experiment.schema import Experiment, ExperimentLike, by_name
 from mjfim.experiment.system import System
@@ -472,6 +470,55 @@ class DesignTask:
         wave = multisine(self.t, len(self.controls), 1.0 / self.horizon, RANDOM_HARMONICS, rng)
         return self._inside_ranges(about + window * (peak * rng.uniform(least, most) * wave), 0.0)
 
+    def bandwidth_basis(self, t: Array) -> Array | None:
+        """Make the splines of the bandwidth that the experiment states.
+
+        Args:
+            t: (N,) times [s].
+
+        Returns:
+            (N, M) splines whose sums are the allowed deviations of the control from its centre;
+            None where the bandwidth is not limited.
+
+        Raises:
+            ExperimentError: The bandwidth is above half of the sample rate.
+        """
+        bandwidth, rate = self.experiment.limits.bandwidth, self.experiment.rate
+        if bandwidth is None:
+            return None
+
+        highest = 0.5 * rate
+        if bandwidth > highest:
+            raise ExperimentError(
+                f"limits.bandwidth: {bandwidth:g} Hz; a control at {rate:g} Hz has {highest:g} Hz "
+                "at most"
+            )
+        return self.boundary_splines(t, bandwidth)
+
+    def boundary_splines(self, t: Array, bandwidth: float) -> Array:
+        """Make splines that begin and end as the experiment's `[boundary]` states.
+
+        Args:
+            t: (N,) times [s].
+            bandwidth: Their bandwidth [Hz].
+
+        Returns:
+            (N, M) splines.
+        """
+        boundary = self.experiment.boundary
+        is_periodic = boundary.end == "periodic"
+        starts_at_rest = boundary.start == "rest"
+
+        # A periodic control that starts at rest ends at rest too.
+        return spline_basis(
+            t,
+            self.horizon,
+            bandwidth,
+            starts_at_rest,
+            boundary.end == "rest" or (is_periodic and starts_at_rest),
+            is_periodic and not starts_at_rest,
+        )
+
     def fade(self, samples: int) -> Array:
         """(samples, 1) window between 0 and 1 that fades a control in and out.
 
@@ -600,15 +647,16 @@ class DesignTask:
         # A stop acts inside of a limit that the file states wider than the MJCF.
         model = self.system.model
         own = {(each.kind, each.name): each for each in limits_of_model(model)}
-        named = defaultdict(set)
+        inside = set()
         for limit in self.limits:
-            stop = own.get((limit.kind, limit.name), limit)
+            key = limit.kind, limit.name
+            stop = own.get(key, limit)
             if stop.lower <= limit.lower and limit.upper <= stop.upper:
-                named[limit.kind].add(limit.name)
+                inside.add(key)
 
-        def chosen(names: tuple[str, ...], kind: str) -> tuple[int, ...]:
+        def chosen(names: Sequence[str], kind: str) -> tuple[int, ...]:
             """Numbers of the elements that have a limit of a kind."""
-            return tuple(i for i, name in enumerate(names) if name in named[kind])
+            return tuple(i for i, name in enumerate(names) if (kind, name) in inside)
 
         tendons = unique_names(model, "tendon")
         return Relaxation(

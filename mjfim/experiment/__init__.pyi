@@ -1,6 +1,6 @@
 from .schema import Experiment, json_schema
+from .signals import TimeGrid
 from .system import System
-from .time_grid import TimeGrid
 
 __all__ = [
     "Experiment",

@@ -188,10 +188,10 @@ class _Units:
     @cached_property
     def tables(self) -> dict[Keys, dict[str, str]]:
         """Units by name for the keys that state one number for all names, or numbers by name."""
-        model, coordinates = self.source.model, self.source.coordinates
-        controls = dict(zip(coordinates.controls, control_units(model), strict=True))
+        coordinates = self.source.coordinates
+        controls = dict(zip(coordinates.controls, control_units(self.source.model), strict=True))
         deviations = {c.name: c.unit for c in coordinates.deviations}
-        tables: dict[Keys, dict[str, str]] = {
+        tables = {
             ("initial", "control", "amplitude"): controls,
             ("initial", "control", "offset"): controls,
             ("cost", "control_about"): controls,
@@ -201,8 +201,9 @@ class _Units:
         }
         for key, field in (("friction", "frictionloss"), ("armature", "armature")):
             units = JOINT_FIELD_UNITS[field]
-            joints = {joint.name: units[joint.unit] for joint in coordinates.scalar_joints}
-            tables["nuisance", key] = joints
+            tables["nuisance", key] = {
+                joint.name: units[joint.unit] for joint in coordinates.scalar_joints
+            }
         for kind, limited in self.elements.items():
             units = {name: element.unit for name, element in limited.items()}
             # A free joint is stated by its name, with the ranges of its coordinates.

@@ -25,9 +25,8 @@ from mjfim.experiment.initial import initial_state, keyframe
 from mjfim.experiment.packing import for_workers, model_of
 from mjfim.experiment.parameters import resolve_parameters
 from mjfim.experiment.schema import Experiment, ExperimentLike, experiment_of
-from mjfim.experiment.signals import resolve_controllers, resolve_outputs
+from mjfim.experiment.signals import TimeGrid, noise_strides, resolve_controllers, resolve_outputs
 from mjfim.experiment.stated_units import require_units
-from mjfim.experiment.time_grid import TimeGrid, noise_strides
 from mjfim.model.clearance import with_floor
 from mjfim.model.control_laws import FIELDS, TIMES, ControlLaws, law_unit
 from mjfim.model.coordinates import (

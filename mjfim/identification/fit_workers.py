@@ -130,9 +130,9 @@ class FitWorkers:
         orders = self._orders(problem, works)
         budget = Budget(stop=StopToken(also=hurried))
         found = {
-            outcome.index: self._counted(problem, outcome.result)
-            for outcome in carry_out(self._executor, _carry_out, orders, budget)
-            if not outcome.is_lost
+            index: self._counted(problem, result)
+            for index, results in carry_out(self._executor, _carry_out, orders, budget)
+            for result in results
         }
         alone = replace(problem, workers=None)
         return [

@@ -8,6 +8,7 @@ starts follow, and then other lengths of the segments. The best result is kept.
 from __future__ import annotations
 
 import time
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import PurePath
@@ -21,7 +22,6 @@ from mjfim.experiment.given import Arrays, RecordingsLike, recordings_of
 from mjfim.experiment.schema import ExperimentLike
 from mjfim.experiment.system import System
 from mjfim.identification.assessment.accuracy import FitResult
-from mjfim.identification.assessment.poor_fit import touched_in
 from mjfim.identification.assessment.report import estimate_from
 from mjfim.identification.assessment.residual_tests import fit_quality, misfit_reasons
 from mjfim.identification.fit_problem import FitProblem, have_same_initial_states, sensitivity_rows
@@ -55,6 +55,7 @@ from mjfim.information.null_space import (
     find_null_space,
     has_weak_column,
 )
+from mjfim.model.variants import allows_dry_friction_only
 from mjfim.optimize.levenberg_marquardt import (
     SearchSettings,
     Solution,
@@ -63,6 +64,7 @@ from mjfim.optimize.levenberg_marquardt import (
 )
 from mjfim.parallel import ExecutorLike, one_blas_thread
 from mjfim.parallel.budget import Budget, StopToken, stop_on_interrupt
+from mjfim.plant.active_constraints import acting_constraints, forward_samples
 from mjfim.recordings.checks import contradiction_remarks
 from mjfim.recordings.section import ColumnSpec
 from mjfim.records.estimate import Estimate, Restart
@@ -386,12 +388,37 @@ def _with_lost_held(search: FitSearch, fit: FitResult) -> FitResult:
     return fit if found is None else replace(found, null_space=lost)
 
 
+# Beginnings of the descriptions of what a motion touches, and largest number of samples that are
+# looked at.
+TOUCHES = ("contact ", "limit of ", "friction or limit of ")
+MAX_TOUCHED_SAMPLES = 20_000
+
+
+def _touched_in(fit: FitResult) -> str:
+    """Stops and contacts that act along the fitted motions, in words; empty without any."""
+    problem, at = fit.problem, fit.solution.unknowns
+    model, found = problem.system.plant.model(problem.theta(at)), Counter[str]()
+    if allows_dry_friction_only(model):
+        return ""
+    samples = 0
+    for i in range(len(problem.recordings)):
+        motion = problem.motion(at, i, max(MAX_TOUCHED_SAMPLES - samples, 1))
+        if motion is None:
+            continue
+        samples += motion.samples
+        for _, data in forward_samples(model, motion, range(motion.samples)):
+            acting = set(acting_constraints(model, data))
+            found.update(name for name in acting if name.startswith(TOUCHES))
+    found_in = [f"{name} in {n} of {samples} samples" for name, n in found.items()]
+    return listed(found_in) if found_in else ""
+
+
 def _beyond_stops(search: FitSearch, fit: FitResult) -> FitResult:
     """The fit, or a better one where a joint stop or a contact acts.
 
     The residuals jump there, and a search ends at the jump.
     """
-    touches = touched_in(fit) if is_doubtful(fit) or fit.solution.stuck else ""
+    touches = _touched_in(fit) if is_doubtful(fit) or fit.solution.stuck else ""
     for _ in range(MAX_TOUCH_ROUNDS if touches else 0):
         cost = fit.solution.cost
         start = start_beyond_stops(search, fit) if is_doubtful(fit) else None

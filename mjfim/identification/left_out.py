@@ -293,16 +293,19 @@ class HeldOutLosses:
         """Root mean loss of a value [standard deviations of the noise]."""
         return float(np.sqrt(self.losses.sum() / self.counts.sum()))
 
-    def reduction(self, other: HeldOutLosses) -> Reduction:
-        """By how much another model predicts the same data better than this one.
+    def reduction(self, other: HeldOutLosses) -> tuple[float, float]:
+        """Reduction of the mean loss of a value by another model.
 
         Args:
             other: The losses of the other model on the same blocks.
+
+        Returns:
+            The reduction, negative where the other model predicts worse, and its standard error.
         """
         if not np.isfinite(other.losses).all():
-            return Reduction(mean=-np.inf, standard_error=np.inf)
+            return -np.inf, np.inf
         if not np.isfinite(self.losses).all():
-            return Reduction(mean=np.inf, standard_error=0.0)
+            return np.inf, 0.0
 
         # Blocks of one recording are alike where something differs from recording to recording, so
         # that the scatter between the parts counts as well.
@@ -313,9 +316,17 @@ class HeldOutLosses:
         standard_error = max(
             _standard_error(difference, self.counts), _standard_error(by_part, counts_by_part)
         )
-        mean = float(difference.sum() / self.counts.sum())
-        least = EQUAL_LOSS * float(min(self.losses.sum(), other.losses.sum()) / self.counts.sum())
-        return Reduction(mean=mean, standard_error=standard_error, least=least)
+        return float(difference.sum() / self.counts.sum()), standard_error
+
+    def is_clearly_above(self, other: HeldOutLosses) -> bool:
+        """Whether another model predicts the same data better by more than one standard error.
+
+        Args:
+            other: The losses of the other model on the same blocks.
+        """
+        mean, standard_error = self.reduction(other)
+        least = EQUAL_LOSS * min(self.losses.sum(), other.losses.sum()) / self.counts.sum()
+        return bool(mean > max(standard_error, least))
 
     @property
     def jackknife(self) -> Array:
@@ -324,26 +335,6 @@ class HeldOutLosses:
         NaN with fewer than two parts.
         """
         return jackknife_std(self.estimates)
-
-
-@record
-class Reduction:
-    """Reduction of the mean loss of a value by another model.
-
-    Attributes:
-        mean: The reduction; negative where the other model predicts worse.
-        standard_error: Its standard error.
-        least: Reduction below which both models predict equally well.
-    """
-
-    mean: float
-    standard_error: float
-    least: float = 0.0
-
-    @property
-    def is_clear(self) -> bool:
-        """Whether the other model predicts better by more than one standard error."""
-        return self.mean > max(self.standard_error, self.least)
 
 
 def _standard_error(sums: Array, counts: Array) -> float:
@@ -472,8 +463,8 @@ def losses_of(
     masks = part.masks(problem)
     predicting, at = with_initial_states(problem, theta, masks, budget)
     predicted = predicting.predict(at)
-    losses: list[float] = []
-    counts: list[float] = []
+    losses = []
+    counts = []
     for i in part.recordings:
         rows = np.flatnonzero(masks[i].any(axis=1))
         for block in np.array_split(rows, min(blocks, len(rows)) or 1):

@@ -72,26 +72,36 @@ class Meter:
 
     @checked
     def __init__(self, experiment: ExperimentLike, *, threads: int | None = None) -> None:
-        self.system = System.resolve(experiment, threads=threads)
-        if self.system.laws is not None:
+        system = self.system = System.resolve(experiment, threads=threads)
+        if system.laws is not None:
             raise ExperimentError(
-                f"{self.system.experiment.source}: controllers: a stream is watched without "
+                f"{system.experiment.source}: controllers: a stream is watched without "
                 "control laws; record it, and check the recording with `mjfim check`"
             )
-        p = self.system.parameters
-        is_held = np.isin(p.names, self.system.experiment.fit.hold)
+        p = system.parameters
+        is_held = np.isin(p.names, system.experiment.fit.hold)
         self._asked = np.setdiff1d(p.interest, np.flatnonzero(is_held))
         self._sizes = p.sizes(p.guess)
-        self._is_stated = bool(np.isfinite(p.wanted).any())
         self._wanted = p.wanted if self._is_stated else DEFAULT_RELATIVE_STD * self._sizes
 
-        # Rows that are still needed, with times since the first one; then results over time.
+        # Rows that are still needed, with times since the first one.
         self._kept: list[tuple[float, Array, Array]] = []
-        self._origin, self._latest, self._rows = 0.0, -np.inf, 0
+        self._origin = 0.0
+        self._latest = -np.inf
+        self._rows = 0
         self._simulation: _Simulation | None = None
         self._warnings: tuple[str, ...] = ()
-        self._times, self._history, self._spacing = [0.0], [np.full(len(p), np.inf)], 0.0
+
+        # Results over time.
         self._reached = np.full(len(p), np.inf)
+        self._times = [0.0]
+        self._history = [self._reached]
+        self._spacing = 0.0
+
+    @property
+    def _is_stated(self) -> bool:
+        """Whether the experiment states standard deviations that it aims at."""
+        return bool(np.isfinite(self.system.parameters.wanted).any())
 
     def add(
         self, t: float, ctrl: Sequence[float] | Array, measured: Sequence[float] | Array

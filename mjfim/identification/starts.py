@@ -272,18 +272,17 @@ def spread_starts(
     Returns:
         (n, p) starts, the given one first; only this one if all parameters keep their values.
     """
-    starts = np.tile(theta, (SPREAD_STARTS, 1))
     moved = ~np.isin(parameters.names, held) & ~np.asarray(parameters.outside_model)
     if not moved.any():
-        return starts[:1]
-    cube = scipy.stats.qmc.LatinHypercube(int(moved.sum()), rng=rng)
-    shifts = 2.0 * cube.random(SPREAD_STARTS - 1) - 1.0
-    for shift, j in zip(shifts.T, np.flatnonzero(moved).tolist(), strict=True):
-        parameter = parameters.parameters[j]
-        if parameter.size == abs(parameter.guess) and theta[j] != 0.0:
-            starts[1:, j] *= LARGEST_FACTOR**shift
-        else:
-            starts[1:, j] += parameters.magnitude[j] * shift
+        return theta[None]
+    cube = scipy.stats.qmc.LatinHypercube(np.count_nonzero(moved), rng=rng)
+    shifts = np.zeros((SPREAD_STARTS, len(theta)))
+    shifts[1:, moved] = 2.0 * cube.random(SPREAD_STARTS - 1) - 1.0
+
+    # A parameter whose magnitude is that of its guess is a scalar, which keeps its sign.
+    magnitude = parameters.magnitude
+    is_scaled = (magnitude == np.abs(parameters.guess)) & (theta != 0.0)
+    starts = np.where(is_scaled, theta * LARGEST_FACTOR**shifts, theta + magnitude * shifts)
     starts[1:] = np.clip(starts[1:], parameters.lower, parameters.upper)
     for start in starts[1:]:
         make_physical(start, theta, unphysical)
@@ -599,12 +598,11 @@ def _chosen(losses: Sequence[Sequence[HeldOutLosses]]) -> int:
     ]
     best = min(joined, key=lambda each: each.error)
     relevant = RELEVANT_SHARE * best.error**2
-    good = []
-    for i, each in enumerate(joined):
-        reduction = each.reduction(best)
-        if not (reduction.is_clear and reduction.mean > relevant):
-            good.append(i)
-    return max(good)
+    return max(
+        i
+        for i, each in enumerate(joined)
+        if not (each.is_clearly_above(best) and each.reduction(best)[0] > relevant)
+    )
 
 
 def _half_width(without: Array, confidence: float) -> Array:

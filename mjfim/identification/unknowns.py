@@ -7,6 +7,7 @@ unknowns of the segments.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 from functools import cached_property
 from typing import Self
@@ -349,15 +350,20 @@ class FitUnknowns:
             residual = earlier @ (self.theta_of_recording(at, 0) - parameters.guess)
             rows.append(np.column_stack([self.to_columns(earlier, 0), residual]))
 
-        # An inertia with a value for each recording has a prior in each of them.
-        is_own = np.isin(np.arange(len(parameters)), self.per_recording)
+        return np.concatenate([*rows, *self._rows_of_inertias(at)])
+
+    def _rows_of_inertias(self, at: UnknownValues) -> Iterator[Array]:
+        """Rows `[J, r]` of the priors from the model's inertias, on the common unknowns.
+
+        An inertia with a value for each recording has a prior in each of them.
+        """
+        is_own = np.isin(np.arange(len(self.parameters)), self.per_recording)
         for is_wanted, count in ((~is_own, 1), (is_own, len(self.recordings))):
             bodies = [body for body in self._cad_bodies if is_wanted[body.columns].all()]
             for recording in range(count if bodies else 0):
                 found = cad_rows(bodies, self.theta_of_recording(at, recording))
                 columns = self.to_columns(found[:, :-1], recording)
-                rows.append(np.column_stack([columns, found[:, -1]]))
-        return np.concatenate(rows)
+                yield np.column_stack([columns, found[:, -1]])
 
     @cached_property
     def _cad_bodies(self) -> tuple[UnknownBody, ...]:
@@ -396,23 +402,25 @@ class FitUnknowns:
         theta = np.array(at.theta)
         count = len(self.shared)
         theta[self.shared] += common[:count]
-        own = at.per_recording + common[count:].reshape(at.per_recording.shape)
 
         follows = np.eye(len(theta))
         for body in self.shared_bodies:
-            begin = at.theta[body.columns]
-            step = theta[body.columns] - begin
+            columns = body.columns
+            begin = at.theta[columns]
+            step = theta[columns] - begin
             if not body.is_physical_after(begin, step):
                 return None
-            theta[body.columns] = body.moved(begin, step)
+            theta[columns] = body.moved(begin, step)
 
             # Without a way through barycentric coordinates, from which those of a body that is
             # nearly a rod cannot always be found.
-            at_end, at_begin = body.linear_slopes(theta[body.columns]), body.linear_slopes(begin)
-            follows[np.ix_(body.columns, body.columns)] = np.linalg.solve(at_end.T, at_begin.T)
+            follows[np.ix_(columns, columns)] = np.linalg.solve(
+                body.linear_slopes(theta[columns]).T, body.linear_slopes(begin).T
+            )
 
+        own = at.per_recording + common[count:].reshape(at.per_recording.shape)
         rows = self.common_rows(replace(at, theta=theta, per_recording=own))
-        rows[:, :count] = rows[:, :count] @ follows[np.ix_(self.shared, self.shared)]
+        rows[:, :count] @= follows[np.ix_(self.shared, self.shared)]
         return rows
 
     def private_rows(self, at: UnknownValues) -> Array:
@@ -425,28 +433,22 @@ class FitUnknowns:
             (P, k, m) rows `[J_private, J_common, r]`.
         """
         count, n = at.private.shape
-        m = n + self.column_count + 1
-        diagonal = np.arange(n)
-
-        # A weak prior on a free initial state, for components that no output determines.
+        # A weak prior on a free initial state, for components that no output determines; stated
+        # priors on the deviations of another one.
         if self.free_starts:
-            rows = np.zeros((count, n, m))
             sizes = np.abs(self.start_directions).T @ self.system.plant.sizes.state
-            sigma = FREE_START_SIGMA * sizes
-            rows[:, diagonal, diagonal] = 1.0 / sigma
-            rows[:, :, -1] = at.private / sigma
-            return rows
-
-        # Stated priors on the deviations of the initial state.
-        parameters, private = self.parameters, self.private
-        weight = parameters.prior_weight[private] * self.with_priors
-        pin_count = len(self.pins) if self._pins_involve_private else 0
-        rows = np.zeros((count, n + pin_count, m))
-        rows[:, diagonal, diagonal] = weight
-        rows[:, :n, -1] = weight * (at.private - parameters.guess[private])
+            weight = 1.0 / (FREE_START_SIGMA * sizes)
+            deviation = at.private
+        else:
+            weight = self.parameters.prior_weight[self.private] * self.with_priors
+            deviation = at.private - self.parameters.guess[self.private]
+        pin_count = len(self.pins) if self._pins_involve_private and not self.free_starts else 0
+        rows = np.zeros((count, n + pin_count, n + self.column_count + 1))
+        rows[:, :n, :n] = np.diag(weight)
+        rows[:, :n, -1] = weight * deviation
 
         # Pins that involve private unknowns belong to the first segment.
         if pin_count:
-            rows[0, n:, :n] = self.pins[:, private]
+            rows[0, n:, :n] = self.pins[:, self.private]
             rows[0, n:, n:] = self._pin_rows(at)
         return rows

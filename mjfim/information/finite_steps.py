@@ -99,33 +99,34 @@ def is_rough(
         fine: Its sensitivity with the shorter step, if it is known.
     """
     derivatives = plant.derivatives
-    # Ratio of the second to the first difference step of each parameter.
-    factors = LONGER_STEP_FACTOR * plant.parameters.magnitude / derivatives.parameter_scale
-    factors = np.maximum(factors, LEAST_STEP_FACTOR)
-    coarse = derivatives.sensitivity(theta, trajectory, factors * SENSITIVITY_STEP)
-    if fine is None:
-        fine = derivatives.sensitivity(theta, trajectory)
+    fine = fine or derivatives.sensitivity(theta, trajectory)
     # A trajectory that diverges after a small change of the parameters has no derivative at all.
-    if fine is None or coarse is None:
+    if fine is None:
         return True
 
     G = noise.whiten(fine.G)
-    visible = np.flatnonzero(visible_columns(plant.parameters, G))
-    error = disagreement(G, noise.whiten(coarse.G))[:, visible]
-    if not error.max(initial=0.0) > DISAGREEMENT_TOLERANCE:
+    visible = visible_columns(plant.parameters, G)
+
+    def error(factors: Array) -> Array:
+        """Largest disagreements with steps that are longer by factors: (p,); NaN if it diverges."""
+        coarse = derivatives.sensitivity(theta, trajectory, factors * SENSITIVITY_STEP)
+        if coarse is None:
+            return np.array([np.nan])
+        return np.asarray(disagreement(G, noise.whiten(coarse.G))[:, visible].max(axis=0))
+
+    # Ratio of the second to the first difference step of each parameter.
+    factors = LONGER_STEP_FACTOR * plant.parameters.magnitude / derivatives.parameter_scale
+    factors = np.maximum(factors, LEAST_STEP_FACTOR)
+    longer = error(factors)
+    if longer.max(initial=0.0) <= DISAGREEMENT_TOLERANCE:
         return False
 
     # If a derivative exists, the error of central differences decreases by a factor of nine with a
     # third of the step. The trajectory is then smooth, only strongly curved.
     medium = np.maximum(factors / MEDIUM_STEP_DIVISOR, LEAST_MEDIUM_FACTOR)
-    between = derivatives.sensitivity(theta, trajectory, medium * SENSITIVITY_STEP)
-    if between is None:
-        return True
-    smaller = disagreement(G, noise.whiten(between.G))[:, visible]
     # Dry friction may switch between the shorter steps as well, however little they disagree.
-    has_friction = bool(np.any(plant.model(theta).dof_frictionloss))
-    tolerated = 0.0 if has_friction else DISAGREEMENT_TOLERANCE
-    return not only_curved(smaller.max(axis=0), error.max(axis=0), tolerated)
+    tolerated = 0.0 if plant.model(theta).dof_frictionloss.any() else DISAGREEMENT_TOLERANCE
+    return not only_curved(error(medium), longer, tolerated)
 
 
 def only_curved(medium: Array, longer: Array, tolerated: float) -> bool:

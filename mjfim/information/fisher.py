@@ -479,12 +479,11 @@ class FisherInformation:
 
         R, _ = replace(self, basis=basis).reduced(self.under_white_noise(information))
         unit, size = scaled_to_unit_diagonal(R)
-        axes = basis @ (inverse_root(unit) / size[..., None])
-        scaled = axes @ np.swapaxes(axes, -1, -2)
-        covariance = scaled * np.outer(self.scale[t], self.scale[t]) / self.measure_rate
-        white = np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1))
-        factor = self.widening(white, t)
-        return covariance * factor[..., None] * factor[..., None, :], basis
+        root = inverse_root(unit) / size[..., None] / np.sqrt(self.measure_rate)
+        axes = self.scale[t][:, None] * (basis @ root)
+        white = np.linalg.norm(axes, axis=-1)
+        axes = axes * self.widening(white, t)[..., None]
+        return axes @ np.swapaxes(axes, -1, -2), basis
 
     # Identifiable combinations
 

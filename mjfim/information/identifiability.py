@@ -8,6 +8,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -255,26 +256,22 @@ def _identifiability(
         steps: What single steps of the motion show.
         stop: Asked before each random motion.
     """
-    hidden = _hidden_from_rows(test, _hidden_from_steps(test, [steps]), J, error)
+    hidden = _hidden(test, [steps], J, error)
     along_trajectory = null_space(test, [J], [error], hidden)
     if not along_trajectory.count or stop():
         return _with_groups(test, along_trajectory, along_trajectory)
 
     tried = list(itertools.takewhile(lambda _: not stop(), test.probes(PROBES)))
-    of_probes = [_step_rows(test, probe) for probe in tried]
-    hidden = _hidden_from_rows(test, _hidden_from_steps(test, [steps, *of_probes]), J, error)
-    stack, errors = [J], [error]
+    hidden = _hidden(test, [steps, *(_step_rows(test, probe) for probe in tried)], J, error)
+    rows = [(J, error)]
 
     # Whole motions are differentiated only if single steps do not explain the null space.
     if hidden is None or along_trajectory.count > hidden.shape[1]:
-        differentiated = test.differentiated or (lambda probes: map(test.rows_along, probes))
-        for found in differentiated(itertools.takewhile(lambda _: not stop(), tried)):
-            if found is not None:
-                stack.append(found[0])
-                errors.append(found[1])
+        differentiated = test.differentiated or partial(map, test.rows_along)
+        rows += filter(None, differentiated(itertools.takewhile(lambda _: not stop(), tried)))
 
-    along_all = null_space(test, stack, errors, hidden)
-    return _with_groups(test, along_trajectory, along_all)
+    stack, errors = zip(*rows, strict=True)
+    return _with_groups(test, along_trajectory, null_space(test, stack, errors, hidden))
 
 
 def _step_rows(test: IdentifiabilityTest, trajectory: Trajectory) -> RowsAndError | None:
@@ -328,13 +325,14 @@ def _hidden_from_steps(
     return _without_effect(test, directions, before, NEGLIGIBLE_EFFECT * float(strongest))
 
 
-def _hidden_from_rows(
-    test: IdentifiabilityTest, directions: Array | None, J: Array, error: Array
+def _hidden(
+    test: IdentifiabilityTest, steps: Sequence[RowsAndError | None], J: Array, error: Array
 ) -> Array | None:
     """Directions without effect on single steps that have none on a whole motion either.
 
     Small effects add up over a motion; a contact may be shorter than a sample.
     """
+    directions = _hidden_from_steps(test, steps)
     if directions is None or not directions.shape[1]:
         return directions
 

@@ -4,8 +4,8 @@ Modules:
     lq: Linear recursions, regulator and descent of time-varying linear-quadratic problems.
     projection_operator: Algorithm 1 of Wilson & Murphey, a generator of iterates on the trajectory
         manifold.
-    directions: Descent directions without limits: metric descent and limited-memory BFGS.
-    structured_bfgs: Descent direction under hard limits.
+    directions: Descent directions: metric descent and limited-memory BFGS without limits, and
+        structured BFGS under hard limits.
     cost_models: Barrier of numbers between bounds, and the smooth E-criterion where eigenvalues
         meet.
     condensed_least_squares: Least squares with private unknowns of many segments, eliminated

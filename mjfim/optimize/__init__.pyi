@@ -1,9 +1,8 @@
 from .condensed_least_squares import Condensed, RobustLoss
 from .cost_models import Bounds, relaxed_log_barrier
-from .directions import LBFGS, MetricDescent
+from .directions import LBFGS, MetricDescent, StructuredBFGS
 from .levenberg_marquardt import minimise
 from .lq import regulator
-from .structured_bfgs import StructuredBFGS
 
 __all__ = [
     "LBFGS",

@@ -477,23 +477,21 @@ def bounded_least_squares(A: Array, b: Array, lower: Array, upper: Array) -> Arr
     norms = np.maximum(np.linalg.norm(A, axis=0), SMALLEST_NORM)
 
     # The unbounded minimum is the solution where it lies inside the bounds.
-    d = np.linalg.lstsq(A / norms, b)[0] / norms
-    if (d >= lower).all() and (d <= upper).all():
-        return np.asarray(d)
-
-    # Unknowns whose bounds coincide do not move: lsq_linear needs room between its bounds.
-    low = np.minimum(lower, 0.0)
-    high = np.maximum(upper, 0.0)
-    fixed = high - low <= 0.0
-    d = np.zeros(len(d))
-    if fixed.all():
+    d = np.asarray(np.linalg.lstsq(A / norms, b)[0] / norms)
+    if ((lower <= d) & (d <= upper)).all():
         return d
 
-    low = low[~fixed]
-    high = high[~fixed]
-    norms = norms[~fixed]
+    # Unknowns whose bounds coincide do not move: lsq_linear needs room between its bounds.
+    free = upper > lower
+    d = np.zeros_like(d)
+    if not free.any():
+        return d
+
+    low = lower[free]
+    high = upper[free]
+    norms = norms[free]
     solved = scipy.optimize.lsq_linear(
-        A[:, ~fixed] / norms,
+        A[:, free] / norms,
         b,
         (low * norms, high * norms),
         method="bvls",
@@ -504,8 +502,7 @@ def bounded_least_squares(A: Array, b: Array, lower: Array, upper: Array) -> Arr
     # An unknown that the solver holds at a bound is placed exactly there; the scaling by the norms
     # has round-off.
     inside = np.clip(solved.x / norms, low, high)
-    held = [solved.active_mask < 0, solved.active_mask > 0]
-    d[~fixed] = np.select(held, [low, high], inside)
+    d[free] = np.select([solved.active_mask < 0, solved.active_mask > 0], [low, high], inside)
     return d
 
 

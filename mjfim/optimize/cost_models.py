@@ -22,10 +22,9 @@ step where the smallest eigenvalues reach them, although the larger ones change 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from functools import cache, cached_property
-from typing import Protocol
 
 import numpy as np
 
@@ -273,31 +272,13 @@ class Bounds:
         return value, slope, curvature
 
 
-class StepCurvature(Protocol):
-    """The barrier about a trajectory, from which its curvature along steps follows."""
-
-    def along(
-        self, step: TangentCurve, factors: Sequence[Array] | None
-    ) -> tuple[Weights, tuple[Array, ...], float]:
-        """Curvature along the minimum of a quadratic model, see `curvature_factors`.
-
-        Args:
-            step: The minimum of the model.
-            factors: Factors of the curvature in this model, by kind of limit; None where it has
-                the curvature at the beginning of the step.
-
-        Returns:
-            The Gauss-Newton Hessian with this curvature, as a quadratic form on tangent curves;
-            factors of the curvature at the beginning of the step, by kind of limit; largest ratio
-            of a factor to that in the model that led to the step, at least 1.
-        """
-
-    def scaled(self, mu: float) -> StepCurvature:
-        """Return the curvature of a multiple of the barrier.
-
-        Args:
-            mu: Factor of the barrier.
-        """
+# Curvature of the barrier along the minimum of a quadratic model, see `curvature_factors`. It takes
+# the minimum of the model, and the factors of the curvature in this model by kind of limit; None
+# stands for the curvature at the beginning of the step. It returns the Gauss-Newton Hessian with
+# the curvature along the step, factors of the curvature at its beginning, and the largest ratio of
+# a factor to that in the model that led to the step, at least 1.
+Factors = tuple[Array, ...]
+StepCurvature = Callable[[TangentCurve, Factors | None], tuple[Weights, Factors, float]]
 
 
 @record
@@ -315,7 +296,9 @@ class BarrierExpansion:
         control_scale: (nu,) scale of the control [u-unit].
         control_step_scale: (nu,) scale of the control's change from one sample to the next
             [u-unit], infinite without a limit.
-        curvature: The curvature along steps, or None where only that at the trajectory is known.
+        mu: Weight of the barrier in all of these.
+        curvature: The curvature along steps of the barrier with the weight 1; None where only that
+            at the trajectory is known.
     """
 
     a: Array
@@ -324,6 +307,7 @@ class BarrierExpansion:
     observations: Array
     control_scale: Array
     control_step_scale: Array
+    mu: float = 1.0
     curvature: StepCurvature | None = None
 
     def scaled(self, mu: float) -> BarrierExpansion:
@@ -340,7 +324,7 @@ class BarrierExpansion:
             a=mu * self.a,
             b=mu * self.b,
             weights=self.weights.scaled(mu),
-            curvature=None if self.curvature is None else self.curvature.scaled(mu),
+            mu=mu * self.mu,
         )
 
     def largest_relative_move(self, zeta: TangentCurve) -> float:
@@ -407,13 +391,34 @@ class EigenvalueModel:
         Returns:
             (m,) derivative by the coordinates.
         """
-        return self._changed(d).gradient
+        return self._expanded(d)[1]
 
-    def _changed(self, d: Array) -> _ChangedLogs:
-        """Eigenvalues of the changed logarithm at coordinates d: (m,)."""
+    def _expanded(self, d: Array) -> tuple[float, Array, Array]:
+        """Value up to a constant, gradient (m,) and Hessian (m, m) of the model at d: (m,).
+
+        The derivative of the matrix exponential has divided differences of the exponentials as its
+        entries, in the basis of the eigenvectors (Daleckii & Krein).
+        """
         before = np.diag(np.log(self.eigenvalues / self.eigenvalues[0]))
         logs, vectors = np.linalg.eigh(before + symmetric_matrix(d, len(before)))
-        return _ChangedLogs(logs=logs, vectors=vectors, power=self.power, weight=self.weight)
+        # The smallest eigenvalue is factored out, so that exponentials neither overflow nor vanish.
+        exponentials = np.exp(-self.power * (logs - logs[0]))
+        shares = exponentials / exponentials.sum()
+        value = np.log(exponentials.sum()) / self.power - logs[0]
+
+        # The divided difference of two shares is the larger one times a factor that is q where the
+        # eigenvalues are equal.
+        distance = np.abs(logs[:, None] - logs)
+        is_equal = self.power * distance < EQUAL_EIGENVALUES
+        safe = np.where(is_equal, 1.0, distance)
+        factor = np.where(is_equal, self.power, -np.expm1(-self.power * distance) / safe)
+        divided = np.maximum(shares[:, None], shares) * factor
+
+        units = vectors.T @ symmetric_units(len(logs)) @ vectors
+        curvature = np.einsum("aij,ij,bij->ab", units, divided, units)
+        slopes = np.einsum("aii,i->a", units, shares)
+        hessian = self.weight * (curvature - self.power * np.outer(slopes, slopes))
+        return self.weight * float(value), -self.weight * slopes, hessian
 
     def minimising_gradient(self, d0: Array, spread: Array) -> Array:
         """Gradient of the model at the minimum of `h(d) + 1/2 (d - d0)' spread^-1 (d - d0)`.
@@ -432,90 +437,28 @@ class EigenvalueModel:
         L = vectors * np.sqrt(np.maximum(values, 0.0))
 
         y = np.zeros(len(d0))
-        here = self._changed(d0)
+        value, gradient, hessian = self._expanded(d0)
         for _ in range(MAX_NEWTON_STEPS):
-            g = y + L.T @ here.gradient
+            g = y + L.T @ gradient
             if np.abs(g).max() <= NEWTON_TOLERANCE * max(1.0, np.abs(y).max()):
                 break
 
-            H = np.eye(len(y)) + L.T @ here.hessian @ L
+            H = np.eye(len(y)) + L.T @ hessian @ L
             step = -np.linalg.solve(0.5 * (H + H.T), g)
 
             # The step is halved until the model plus `1/2 |y|^2` falls sufficiently.
-            before, slope = here.value + 0.5 * float(y @ y), float(g @ step)
+            before, slope = value + 0.5 * float(y @ y), float(g @ step)
             fraction = 2.0
             while fraction > 2.0 * MIN_NEWTON_FRACTION:
                 fraction *= 0.5
                 new = y + fraction * step
-                here = self._changed(d0 + L @ new)
-                after = here.value + 0.5 * float(new @ new)
+                value, gradient, hessian = self._expanded(d0 + L @ new)
+                after = value + 0.5 * float(new @ new)
                 if after <= before + SUFFICIENT_DECREASE * fraction * slope:
                     break
             y = new
 
-        return here.gradient
-
-
-@record
-class _ChangedLogs:
-    """The model of a logarithm of the information that has changed.
-
-    Attributes:
-        logs: (r,) eigenvalues of the changed logarithm, ascending, up to a constant.
-        vectors: (r, r) their eigenvectors, in columns.
-        power: Power q of the smooth E-criterion.
-        weight: Weight of the criterion in the cost.
-    """
-
-    logs: Array
-    vectors: Array
-    power: float
-    weight: float
-
-    @cached_property
-    def _exponentials(self) -> Array:
-        """(r,) `exp(-q log)` of the eigenvalues over that of the smallest one.
-
-        The smallest eigenvalue is factored out, so that they neither overflow nor vanish.
-        """
-        return np.asarray(np.exp(-self.power * (self.logs - self.logs[0])))
-
-    @cached_property
-    def _shares(self) -> Array:
-        """(r,) shares of the eigenvalues in the sum of exponentials."""
-        return np.asarray(self._exponentials / self._exponentials.sum())
-
-    @cached_property
-    def value(self) -> float:
-        """The model, up to a constant."""
-        log_sum = np.log(self._exponentials.sum()) / self.power - self.logs[0]
-        return self.weight * float(log_sum)
-
-    @cached_property
-    def gradient(self) -> Array:
-        """(m,) derivative by the coordinates of B."""
-        P = (self.vectors * self._shares) @ self.vectors.T
-        return -self.weight * symmetric_coordinates(P)
-
-    @cached_property
-    def hessian(self) -> Array:
-        """(m, m) second derivative by the coordinates of B.
-
-        The derivative of the matrix exponential has divided differences of the exponentials as its
-        entries, in the basis of the eigenvectors (Daleckii & Krein).
-        """
-        # The divided difference of two shares is the larger one times a factor that is q where the
-        # eigenvalues are equal.
-        distance = np.abs(self.logs[:, None] - self.logs)
-        is_equal = self.power * distance < EQUAL_EIGENVALUES
-        safe = np.where(is_equal, 1.0, distance)
-        factor = np.where(is_equal, self.power, -np.expm1(-self.power * distance) / safe)
-        divided = np.maximum(self._shares[:, None], self._shares) * factor
-
-        units = self.vectors.T @ symmetric_units(len(self.logs)) @ self.vectors
-        curvature = np.einsum("aij,ij,bij->ab", units, divided, units)
-        slopes = np.einsum("aii,i->a", units, self._shares)
-        return np.asarray(self.weight * (curvature - self.power * np.outer(slopes, slopes)))
+        return gradient
 
 
 @cache
@@ -540,7 +483,7 @@ def symmetric_units(r: int) -> Array:
 
 
 def symmetric_matrix(d: Array, r: int) -> Array:
-    """Symmetric matrix of given coordinates.
+    """Symmetric matrix of given coordinates, whose scalar product is that of matrices.
 
     Args:
         d: (m,) coordinates, m = r (r + 1) / 2.
@@ -550,20 +493,6 @@ def symmetric_matrix(d: Array, r: int) -> Array:
         (r, r) matrix.
     """
     return (d @ symmetric_units(r).reshape(-1, r * r)).reshape(r, r)
-
-
-def symmetric_coordinates(full: Array) -> Array:
-    """Coordinates of a symmetric matrix, such that their scalar product is that of matrices.
-
-    Args:
-        full: (r, r) symmetric matrix.
-
-    Returns:
-        (m,) coordinates: diagonal entries, and sqrt(2) times the entries above the diagonal, row by
-        row.
-    """
-    r = len(full)
-    return symmetric_units(r).reshape(-1, r * r) @ full.reshape(r * r)
 
 
 def divided_log_differences(values: Array) -> Array:

@@ -560,6 +560,7 @@ class _Search:
         """Minimiser of the damped linearised cost, within the bounds."""
         values = self.problem.common_values(self.unknowns)
         lower, upper = (bound - values for bound in self.problem.bounds_at(self.unknowns))
+        lower, upper = np.minimum(lower, 0.0), np.maximum(upper, 0.0)
         curved = self.settings.curved_rows
         if curved is None:
             return self.condensed.step(damping, self.scale, lower, upper)

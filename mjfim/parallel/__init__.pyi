@@ -1,4 +1,4 @@
-from .dispatch import LostWorkError, Outcome, carry_out, results, results_on
+from .dispatch import carry_out, results, results_on
 from .pool import (
     LOST_SENTENCE,
     Pool,
@@ -14,8 +14,6 @@ from .workers import ExecutorLike, Workers
 __all__ = [
     "LOST_SENTENCE",
     "ExecutorLike",
-    "LostWorkError",
-    "Outcome",
     "Pool",
     "Workers",
     "carry_out",

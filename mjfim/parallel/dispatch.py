@@ -7,12 +7,11 @@ import uuid
 from collections import defaultdict, deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, wait
-from dataclasses import dataclass
 from functools import partial
 from queue import Empty, SimpleQueue
 from typing import Any, Generic, TypeVar
 
-from mjfim.errors import ExperimentError, MjfimError
+from mjfim.errors import ExperimentError
 from mjfim.parallel.budget import Budget, StopToken, hurried
 from mjfim.parallel.pool import one_blas_thread, pool_stop_token
 from mjfim.parallel.shared_value import KeptPerThread, SentValue, attempt, owned_value
@@ -40,35 +39,8 @@ POLL_INTERVAL = 0.2
 MAX_LOSSES = 3
 
 
-class LostWorkError(MjfimError):
-    """An order has no result, because its worker was lost each time that it was begun."""
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Outcome(Generic[T]):
-    """Result or loss of an order.
-
-    Attributes:
-        index: Number of the order.
-        found: The result; empty where there is none.
-        loss: Sentence that says why there is no result.
-    """
-
-    index: int
-    found: tuple[T, ...] = ()
-    loss: str = ""
-
-    @property
-    def is_lost(self) -> bool:
-        """True where there is no result."""
-        return not self.found
-
-    @property
-    def result(self) -> T:
-        """The result; LostWorkError where there is none."""
-        if self.is_lost:
-            raise LostWorkError(self.loss)
-        return self.found[0]
+# Number of an order, and its result; this is empty where the worker was lost each time.
+Outcome = tuple[int, tuple[T, ...]]
 
 
 class _Dispatch(Generic[Order, T]):
@@ -158,11 +130,7 @@ class _Dispatch(Generic[Order, T]):
         if future.cancelled() or is_loss(error):
             self._losses[index] += 1
             if self._losses[index] == MAX_LOSSES:
-                loss = (
-                    f"the worker was lost {MAX_LOSSES} times while it did this work "
-                    f"({self._workers.probable_fault}), so this work is left out"
-                )
-                return Outcome(index=index, loss=loss)
+                return index, ()
         elif is_refused_by_pickle(error):
             raise ExperimentError(
                 f"executor: the work cannot be sent to other processes ({error}). Functions, such "
@@ -175,7 +143,7 @@ class _Dispatch(Generic[Order, T]):
             if found:
                 del self._values[index]
                 del self._orders[index]
-                return Outcome(index=index, found=found)
+                return index, found
             self._values[index].update({digest: owned_value(digest) for digest in absent})
         self._waiting.appendleft(index)
         return None
@@ -207,19 +175,21 @@ class _Dispatch(Generic[Order, T]):
 
         found: list[Outcome[T]] = []
         for future, index in self._running.items():
-            results: Sequence[Any] = ()
             if future in left:
                 # Nobody waits any longer for a task that does not look at the request.
                 future.cancel()
                 results = () if pool is None else pool.offered(future)
-            elif not future.cancelled() and future.exception() is None:
+            elif future.cancelled() or future.exception() is not None:
+                continue
+            else:
                 results, _ = future.result()
-            found += [Outcome(index=index, found=(result,)) for result in results]
+            found += [(index, (result,)) for result in results]
 
-        if pool is not None and left:
-            pool.end_running()
-        elif pool is not None:
-            pool.resume()
+        if pool is not None:
+            if left:
+                pool.end_running()
+            else:
+                pool.resume()
         self._running.clear()
         return found
 
@@ -236,7 +206,8 @@ def carry_out(
     After a request to stop, what the running tasks have found until then is yielded last.
 
     Yields:
-        Outcomes in the order of the orders; some after a request to stop may be missing.
+        Number and result of each order, in their order; some after a request to stop may be
+        missing. The result is in a tuple, which is empty where its worker was lost each time.
 
     Raises:
         ExperimentError: An order cannot be sent, or a cluster had no workers at all.
@@ -244,10 +215,10 @@ def carry_out(
     dispatch = _Dispatch(Workers.of(executor), function, orders, budget)
     early = {}
     following = 0
-    for outcome in dispatch.arrivals():
-        early[outcome.index] = outcome
+    for index, found in dispatch.arrivals():
+        early[index] = found
         while following in early:
-            yield early.pop(following)
+            yield following, early.pop(following)
             following += 1
 
         # Without the first order there might be no result at all.
@@ -255,7 +226,7 @@ def carry_out(
             dispatch.withdraw()
 
     # What was stopped or left out before them has no outcome.
-    yield from (early[index] for index in sorted(early))
+    yield from sorted(early.items(), key=lambda outcome: outcome[0])
 
 
 def results(
@@ -290,8 +261,8 @@ def results(
         return
 
     orders = list(orders)
-    for outcome in carry_out(workers, function, orders, budget):
-        yield here(orders[outcome.index]) if outcome.is_lost else outcome.result
+    for index, found in carry_out(workers, function, orders, budget):
+        yield found[0] if found else here(orders[index])
 
 
 # The latest objects of a worker, by the key of their study.

@@ -166,14 +166,6 @@ class Workers(Executor):
         self._executor.shutdown(wait, **options)
 
     @property
-    def probable_fault(self) -> str:
-        """Probable reason why processes of the workers have ended, in words."""
-        words = "its process was ended from outside, perhaps because the memory was full"
-        if self.pool is None or self.has_answered:
-            return words
-        return f'{words}, or because a script calls mjfim outside `if __name__ == "__main__":`'
-
-    @property
     def shares_memory(self) -> bool:
         """True for threads of this process, which have all that it has."""
         return isinstance(self._executor, ThreadPoolExecutor)

@@ -320,24 +320,6 @@ MotionPoints = tuple[Array, Array, Array]
 
 
 @record
-class EquationTerms:
-    """Terms of the equation of motion at n points.
-
-    Attributes:
-        needed: (n, nv) forces that the actuators have to give: `(M + τ B) a + c - passive -
-            friction`.
-        inertial: (n, nv) the term `(M + τ B) a` of them.
-        actuation: (n, nv) forces of the actuators on the degrees of freedom.
-        actuator_force: (n, nf) forces of the actuators, by their address.
-    """
-
-    needed: Array
-    inertial: Array
-    actuation: Array
-    actuator_force: Array
-
-
-@record
 class EquationOfMotion:
     """The equation of motion of a plant's models without constraints (`Relaxation.constraints`).
 
@@ -349,15 +331,19 @@ class EquationOfMotion:
     simulator: BatchSimulator
     friction_speeds: Array
 
-    def terms(self, model: Any, points: MotionPoints) -> EquationTerms:
-        """The terms along a motion.
+    def terms(self, model: Any, points: MotionPoints) -> tuple[Array, Array, Array]:
+        """The terms of the equation of motion at n points.
+
+        They are not finite where the engine cannot compute them.
 
         Args:
             model: A model at parameter values.
             points: The motion.
 
         Returns:
-            The terms; they are not finite where the engine cannot compute them.
+            (n, nv) forces that the actuators have to give: `(M + τ B) a + c - passive - friction`;
+            (n, nv) the term `(M + τ B) a` of them; (n, nv+nf) forces of the actuators on the
+            degrees of freedom, then each of them by its address.
         """
         names = ["M", "qfrc_smooth", "qfrc_actuator", "actuator_force"]
         if model.opt.integrator in IMPLICIT:
@@ -369,12 +355,8 @@ class EquationOfMotion:
         inertial += self._implicit_damping(model, fields, points)
         actuation = fields["qfrc_actuator"]
         friction = self._friction(model, points)
-        return EquationTerms(
-            needed=inertial - (fields["qfrc_smooth"] - actuation) - friction,
-            inertial=inertial,
-            actuation=actuation,
-            actuator_force=fields["actuator_force"],
-        )
+        needed = inertial - (fields["qfrc_smooth"] - actuation) - friction
+        return needed, inertial, np.hstack([actuation, fields["actuator_force"]])
 
     def coupling(self, model: Any, points: MotionPoints) -> Array:
         """Root mean squares of the forces on each degree of freedom by each acceleration.
@@ -472,9 +454,13 @@ class EquationOfMotion:
         """(n, nv) forces of dry friction of joints and tendons."""
         speed = self.simulator.space.split(points[0])[1]
         friction = -model.dof_frictionloss * self.directions(speed)
-        if not model.tendon_frictionloss.any():
-            return np.asarray(friction)
+        if model.tendon_frictionloss.any():
+            friction += self._tendon_friction(model, points, speed)
+        return np.asarray(friction)
 
+    def _tendon_friction(self, model: Any, points: MotionPoints, speed: Array) -> Array:
+        """(n, nv) forces of dry friction of tendons at speeds of the joints: (n, nv)."""
+        friction = np.zeros_like(speed)
         # The speeds of a tendon below which its friction is viscous are those of its joints.
         values = self._fields(model, points, ["ten_J"])["ten_J"]
         for tendon in np.flatnonzero(model.tendon_frictionloss).tolist():
@@ -486,7 +472,7 @@ class EquationOfMotion:
             along = np.clip(rate / np.maximum(slow, np.finfo(float).tiny), -1.0, 1.0)
             force = model.tendon_frictionloss[tendon] * along
             friction[:, dofs] -= arms * force[:, None]
-        return np.asarray(friction)
+        return friction
 
 
 def activations(

@@ -176,10 +176,7 @@ class FirstDerivatives:
             return None
 
         self._remember(theta, trajectory, found)
-        psi = np.zeros((len(found.A) + 1, *found.E.shape[1:]))
-        for k, (A, E) in enumerate(zip(found.A, found.E, strict=True)):
-            psi[k + 1] = A @ psi[k] + E
-        return among, np.moveaxis(psi, 2, 0)
+        return among, np.moveaxis(_propagated(found.A, found.E), 2, 0)
 
     def closed_form_mixed(
         self, theta: Array, trajectory: Trajectory, psi: Array, directions: Array
@@ -384,7 +381,12 @@ class FirstDerivatives:
             observed = observation_jacobian(origin, trajectory.ctrl, observations)
             if observed is not None:
                 return origin.A, origin.B, observed
+        return self._differences(theta, trajectory, observations)
 
+    def _differences(
+        self, theta: Array, trajectory: Trajectory, observations: SubstepObservations
+    ) -> tuple[Array, Array, Array]:
+        """One-sided differences of F and of observations by state and control."""
         plant, nx = self.plant, self.plant.space.nx
         steps = FIRST_DERIVATIVE_STEP * self.difference_sizes(trajectory)
         moved = self._move_samples(trajectory.state[:-1], trajectory.ctrl, steps, False)
@@ -562,6 +564,14 @@ def all_samples(trajectory: Trajectory) -> tuple[Array, Array]:
 def tiled(curve: Array, count: int) -> Array:
     """(count*n, k) copies of a curve: (n, k), one after the other; k may be 0."""
     return np.tile(curve, (count, 1))
+
+
+def _propagated(A: Array, E: Array) -> Array:
+    """(N+1, nx, c) sensitivities `psi_{k+1} = A_k psi_k + E_k` that begin at zero."""
+    psi = np.zeros((len(A) + 1, *E.shape[1:]))
+    for k, (A_k, E_k) in enumerate(zip(A, E, strict=True)):
+        psi[k + 1] = A_k @ psi[k] + E_k
+    return psi
 
 
 def _require_finite(derivative: Array) -> Array:

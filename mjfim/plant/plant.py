@@ -546,9 +546,8 @@ class Plant(Dynamics):
             The plant with longer difference steps for parameters that hardly move this trajectory,
             or the plant itself if a perturbed rollout diverges.
         """
-        derivatives, outputs = self.derivatives, self.outputs
-        has_sensors = outputs.needs_sensors
-        measured = derivatives.rollout_differences(
+        has_sensors = self.outputs.needs_sensors
+        measured = self.derivatives.rollout_differences(
             theta,
             trajectory.state[0],
             trajectory.ctrl,
@@ -562,14 +561,20 @@ class Plant(Dynamics):
         if measured is None:
             return self
 
-        # Sensors are relative to their largest values; those that stay zero do not count. The other
-        # outputs are states.
-        y, found = measured
-        is_sensor = np.array([output.sensor is not None for output in outputs.outputs])
-        largest = np.where(is_sensor, np.abs(y).max(axis=0, initial=0.0), 0.0)
-        state_sizes = derivatives.difference_sizes(trajectory)[: self.space.nx]
-        sizes = np.concatenate([state_sizes, np.where(largest > 0.0, largest, np.inf)])
-        moves = np.concatenate([found.psi, found.G], axis=1) * self.parameters.magnitude
-        effect = (np.abs(moves).max(axis=0) / sizes[:, None]).max(axis=0)
-        factors = np.clip(MIN_PARAMETER_EFFECT / np.maximum(effect, TINY), 1.0, MAX_STEP_FACTOR)
+        effects = self._effects(trajectory, *measured)
+        factors = np.clip(MIN_PARAMETER_EFFECT / np.maximum(effects, TINY), 1.0, MAX_STEP_FACTOR)
         return self.with_step_factors(factors if wanted is None else np.where(wanted, factors, 1.0))
+
+    def _effects(self, trajectory: Trajectory, y: Array, sensitivity: Sensitivity) -> Array:
+        """(p,) largest effects of the parameters on states and sensors, relative to their sizes.
+
+        Sensors are relative to their largest values; those that stay zero do not count. The other
+        outputs are states.
+        """
+        is_sensor = np.array([output.sensor is not None for output in self.outputs.outputs])
+        largest = np.where(is_sensor, np.abs(y).max(axis=0, initial=0.0), 0.0)
+        state_sizes = self.derivatives.difference_sizes(trajectory)[: self.space.nx]
+        sizes = np.concatenate([state_sizes, np.where(largest > 0.0, largest, np.inf)])
+        moves = np.concatenate([sensitivity.psi, sensitivity.G], axis=1)
+        moves = np.abs(moves * self.parameters.magnitude).max(axis=0)
+        return np.asarray((moves / sizes[:, None]).max(axis=0))

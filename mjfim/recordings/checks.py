@@ -195,8 +195,7 @@ def check_measured(where: str, t: Array, values: Array, gap: float, *, may_rest:
     advice = "remove it from the file or from [recording.columns]"
     if not len(present):
         raise RecordingError(f"{where} holds no number; {advice}")
-    is_constant = len(present) >= DEAD_CHANNEL_ROWS and np.ptp(values[present]) == 0.0
-    if is_constant and not may_rest:
+    if not may_rest and len(present) >= DEAD_CHANNEL_ROWS and np.ptp(values[present]) == 0.0:
         raise RecordingError(
             f"{where} is {values[present[0]]:g} in all of its {len(present)} rows, which suggests "
             f"a dead channel; {advice}"
@@ -206,8 +205,8 @@ def check_measured(where: str, t: Array, values: Array, gap: float, *, may_rest:
     limit = longest_bridged_gap(t[present], gap) if len(present) > 1 else gap
     edges = np.concatenate([t[:1], t[present], t[-1:]])
     longest = np.argmax(np.diff(edges))
-    if edges[longest + 1] - edges[longest] > limit:
-        begin, end = edges[longest] - t[0], edges[longest + 1] - t[0]
+    begin, end = edges[longest : longest + 2] - t[0]
+    if end - begin > limit:
         raise RecordingError(
             f"{where} is empty from {begin:g} to {end:g} s; gaps longer than {limit:g} s are not "
             "bridged: exclude this time by recording.window, or raise recording.gap"
@@ -429,6 +428,18 @@ def plausibility_remarks(
     )
 
 
+def _range_remark(name: str, u: Array, low: float, high: float) -> Iterator[str]:
+    """Remark about a control u: (n,) that is outside its range in more than a few rows."""
+    tolerance = RANGE_TOLERANCE * (high - low)
+    share = np.mean((u < low - tolerance) | (u > high + tolerance))
+    if share > MAX_SHARE_OUTSIDE_RANGE:
+        yield (
+            f"control {name!r} is outside its ctrlrange [{low:g}, {high:g}] in {100 * share:.2g} % "
+            f"of the rows (it ranges from {u.min():.3g} to {u.max():.3g}); the simulation clamps "
+            "it to the range"
+        )
+
+
 def _control_remarks(channels: Channels, ctrl: Array) -> Iterator[str]:
     """Remarks about controls ctrl: (M-1, nu) that are outside their range or look like noise."""
     model = channels.model
@@ -438,15 +449,8 @@ def _control_remarks(channels: Channels, ctrl: Array) -> Iterator[str]:
             continue
         name = column.removeprefix("ctrl:")
         i = channels.controls.index(name)
-        low, high = model.actuator_ctrlrange[i]
-        tolerance = RANGE_TOLERANCE * (high - low)
-        share = np.mean((u < low - tolerance) | (u > high + tolerance))
-        if model.actuator_ctrllimited[i] and share > MAX_SHARE_OUTSIDE_RANGE:
-            yield (
-                f"control {name!r} is outside its ctrlrange [{low:g}, {high:g}] in "
-                f"{100 * share:.2g} % of the rows (it ranges from {u.min():.3g} to {u.max():.3g}); "
-                "the simulation clamps it to the range"
-            )
+        if model.actuator_ctrllimited[i]:
+            yield from _range_remark(name, u, *model.actuator_ctrlrange[i])
 
         rough = np.var(_rough_part(u)) / np.var(u)
         correlation = np.corrcoef(u[1:], u[:-1])[0, 1]

@@ -654,13 +654,7 @@ def _merged(path: Path, samples: Samples, with_topic: bool) -> Table:
     for ((topic, quantity, joint), (_, numbers)), own in zip(
         samples.items(), all_stamps, strict=True
     ):
-        steps = np.diff(own)
-        if np.any(steps <= 0):
-            row = np.argmax(steps <= 0)
-            raise RecordingError(
-                f"{path}: topic {topic!r}: {quantity} of {joint!r}, message {row + 2} is "
-                f"{steps[row] / NANOSECONDS:g} s after the previous one; time must increase"
-            )
+        _require_increasing(own, f"{path}: topic {topic!r}: {quantity} of {joint!r}")
         is_control = topic == CONTROL_TOPIC
         prefix = f"{topic}:" if with_topic or is_control else ""
         label = "ctrl" if is_control and quantity == "effort" else f"{prefix}{quantity}"
@@ -670,6 +664,17 @@ def _merged(path: Path, samples: Samples, with_topic: bool) -> Table:
     return Table.of(path, columns, RecordingSpec(time="t"))
 
 
+def _require_increasing(stamps: np.ndarray, where: str) -> None:
+    """Refuse messages whose time stamps [ns] do not increase."""
+    steps = np.diff(stamps)
+    if np.any(steps <= 0):
+        row = np.argmax(steps <= 0)
+        raise RecordingError(
+            f"{where}, message {row + 2} is {steps[row] / NANOSECONDS:g} s after the previous one; "
+            "time must increase"
+        )
+
+
 def _read_mcap(path: Path, spec: RecordingSpec) -> Table:
     """Read the JSON messages of an MCAP file; without any, its joint states of ROS 2.
 
@@ -677,22 +682,29 @@ def _read_mcap(path: Path, spec: RecordingSpec) -> Table:
     the time `t` at which messages were logged, since the first one [s].
     """
     reader = module_of_extra(path, "mcap.reader")
-    kind = "a readable MCAP file (damaged or truncated?)"
-    with _reading(path, kind, (Exception,)), path.open("rb") as file:
+    with (
+        _reading(path, "a readable MCAP file (damaged or truncated?)", (Exception,)),
+        path.open("rb") as file,
+    ):
         log = reader.make_reader(file)
-        channels = log.get_summary().channels.values()
-        topics = [each.topic for each in channels if each.message_encoding == "json"]
-        wanted = [topic for topic in topics if topic in (spec.topics or topics)]
+        topics = [
+            channel.topic
+            for channel in log.get_summary().channels.values()
+            if channel.message_encoding == "json"
+        ]
+        wanted = {*topics} & {*(spec.topics or topics)}
         messages = [
             (channel.topic, message.log_time, json.loads(message.data))
-            for _, channel, message in (log.iter_messages(wanted) if wanted else ())
+            for _, channel, message in log.iter_messages(wanted)
         ]
     if not topics:
         return read_bag(path, spec)
     _require_seconds(path, spec)
     if not messages:
-        fault = f"no message of {listed(spec.topics or topics)}; found: {listed(topics)}"
-        raise RecordingError(f"{path}: recording.topics: {fault}")
+        raise RecordingError(
+            f"{path}: recording.topics: no message of {listed(spec.topics or topics)}; found: "
+            f"{listed(topics)}"
+        )
     begin = messages[0][1]
     rows = [
         {"t": (stamp - begin) / NANOSECONDS, **dict(_numbers(content, topic))}
@@ -842,17 +854,23 @@ def _reader(path: Path) -> Reader | None:
     return next((read for ending, read in READERS.items() if name.endswith(ending)), None)
 
 
+def _numbers_of_files(
+    files: Sequence[Path], spec: RecordingSpec
+) -> Iterator[tuple[str, dict[str, Array]]]:
+    """Stems of the tables that have two or more columns of numbers, and these columns."""
+    for file in files:
+        table = _read_csv(file, spec)
+        numbers = {n: table.column(n) for n in table.names if not _fault(table.contents[n])}
+        if len(numbers) > 1:
+            yield file.name.partition(".")[0], numbers
+
+
 def _read_folder(path: Path, files: Sequence[Path], spec: RecordingSpec) -> Table:
     """Read tables of one clock, such as one for commands and one for states, as one table.
 
     The column that all of them have is the time; the others are called `<file>:<column>`.
     """
-    columns = {}
-    for file in files:
-        table = _read_csv(file, spec)
-        numbers = {n: table.column(n) for n in table.names if not _fault(table.contents[n])}
-        if len(numbers) > 1:
-            columns[file.name.partition(".")[0]] = numbers
+    columns = dict(_numbers_of_files(files, spec))
     shared = [
         name
         for name in next(iter(columns.values()), {})

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 from collections import defaultdict
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from functools import partial
 from typing import Any
@@ -179,6 +179,15 @@ def _matches(
     return max(found, key=lambda each: each[:2], default=(0, False, {}))[2]
 
 
+def _servos(channels: Channels) -> Iterator[tuple[str, str]]:
+    """Columns of the references of position servos, each with the column of its joint."""
+    model, joints = channels.model, joint_names(channels.model)
+    for i, name in enumerate(channels.control_columns):
+        is_servo = model.actuator_biastype[i] == mujoco.mjtBias.mjBIAS_AFFINE
+        if is_servo and model.actuator_trntype[i] == mujoco.mjtTrn.mjTRN_JOINT:
+            yield name, f"qpos:{joints[model.actuator_trnid[i, 0]]}"
+
+
 def _units(
     table: Table, channels: Channels, found: Mapping[str, tuple[str, str]], t: Array
 ) -> dict[str, str]:
@@ -191,13 +200,7 @@ def _units(
             units[name] = "deg/s" if name.startswith("qvel:") else "deg"
             values[name] = np.radians(values[name])
     # The references of a servo have the unit of its joint.
-    model, joints = channels.model, joint_names(channels.model)
-    for i, name in enumerate(channels.control_columns):
-        is_servo = model.actuator_biastype[i] == mujoco.mjtBias.mjBIAS_AFFINE
-        if is_servo and model.actuator_trntype[i] == mujoco.mjtTrn.mjTRN_JOINT and name in found:
-            position = f"qpos:{joints[model.actuator_trnid[i, 0]]}"
-            if position in units:
-                units[name] = units[position]
+    units |= {name: units[at] for name, at in _servos(channels) if name in found and at in units}
     return {name: unit for name, unit in units.items() if not table.unit(found[name][0])}
 
 

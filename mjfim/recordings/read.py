@@ -417,9 +417,10 @@ def _columns_by_default_name(table: Table, channels: Channels) -> dict[str, str]
     """Names of the table's columns, by the names that mjfim gives them."""
     found: dict[str, str] = {}
     for name in table.names:
-        matches = ((re.fullmatch(pattern, name), kinds) for pattern, kinds in OTHER_NAMES)
-        match, kinds = next((pair for pair in matches if pair[0]), (None, ()))
-        found |= {f"{kind}{match[1]}": name for kind in kinds if match}
+        for pattern, kinds in OTHER_NAMES:
+            if match := re.fullmatch(pattern, name):
+                found |= {f"{kind}{match[1]}": name for kind in kinds}
+                break
 
     for matrix, parts in _matrices(channels).items():
         labels = [name for name in table.names if name == matrix or name.startswith(f"{matrix}[")]

@@ -121,21 +121,23 @@ class Section(BaseModel):
     @classmethod
     def _words(cls, fault: Any) -> str:
         """Sentence on one value of this table: what is wrong, and what would be right."""
-        kind, place = fault["type"], fault["loc"]
-        field = cls.model_fields.get(str(place[0])) if len(place) == 1 else None
+        kind = fault["type"]
+        # A value inside of a field has a longer place.
+        field = cls.model_fields.get(".".join(map(str, fault["loc"])))
         if kind == "extra_forbidden":
-            return unknown("key", str(place[-1]), cls.valid_keys())
-        if kind == "missing" and field is not None and field.description:
+            return unknown("key", str(fault["loc"][-1]), cls.valid_keys())
+        if kind == "missing" and field and field.description:
             sentence = field.description.split(". ")[0].removesuffix(".")
             return f"{WORDS[kind]}: {sentence[0].lower()}{sentence[1:]}"
-        if kind == "dict_type" and field is not None and field.examples:
+        if kind == "dict_type" and field and field.examples:
             entries = [f"{name} = {value}" for name, value in field.examples[0].items()]
             return f"{WORDS[kind]} by name, for example {{ {', '.join(entries)} }}"
         if kind == "too_short":
             return f"needs {fault['ctx']['min_length']} or more entries"
         message: str = WORDS.get(kind, fault["msg"])
-        begin = next((begin for begin in WORDING if message.startswith(begin)), "")
-        return WORDING.get(begin, "") + message.removeprefix(begin)
+        for begin, instead in WORDING.items():
+            message = message.replace(begin, instead)
+        return message
 
     @classmethod
     def valid_keys(cls) -> list[str]:

@@ -446,7 +446,6 @@ class Estimate(ParameterResult):
             poor fit or a request to stop, and in records of earlier versions.
         per_recording: Values for each recording of the parameters that differ between recordings;
             `theta` holds their values for the first recording.
-        robust_uncertainty: Robust uncertainty of the common unknowns, or None.
         motion: Motion of the fitted model for the first recording, at most its first 200 000
             samples; None where it diverges.
         interrupted: True if the user interrupted the fit.
@@ -527,7 +526,6 @@ class Estimate(ParameterResult):
     sloppy: tuple[str, ...] = ()
     missing_terms: tuple[Term, ...] = ()
     per_recording: dict[str, tuple[float, ...]] = field(default_factory=dict)
-    robust_uncertainty: Uncertainty | None = None
     motion: Trajectory | None = None
     interrupted: bool = False
     seconds: float = 0.0
@@ -917,37 +915,6 @@ class Prediction(Record):
             "nominal_rms": self.nominal.by_output(self.nominal.rms),
             "nominal_mae": self.nominal.by_output(self.nominal.mae),
         }
-
-
-@record
-class Uncertainty(Record):
-    """Robust uncertainty of the c unknowns that all recordings have in common [theta-unit].
-
-    It allows for autocorrelated residuals and for recordings that disagree.
-
-    Attributes:
-        sandwich: (c,) standard deviations that allow for autocorrelated residuals.
-        interval: (c, 2) 95 % intervals, which cover the formal, sandwich and bootstrap intervals.
-        between: (c,) standard deviation between recordings that their standard deviations do not
-            explain.
-        apart: Indices of the unknowns on which recordings disagree.
-        each: (K, c) estimates from each recording alone; NaN where a recording has too little
-            information.
-        blocks: Number of blocks of the bootstrap.
-        draws: (n, c) bootstrap replicates of the estimate.
-        covariance: (c, c) covariance that is in every direction at least the formal one and the
-            sandwich one, without the scatter between recordings; empty in records of earlier
-            versions. `Estimate.honest_covariance` is the one for combinations of parameters.
-    """
-
-    sandwich: Array
-    interval: Array
-    between: Array
-    apart: tuple[int, ...]
-    each: Array
-    blocks: int
-    draws: Array
-    covariance: Array = no_array(0, 0)
 
 
 @record

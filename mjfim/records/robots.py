@@ -70,39 +70,6 @@ FEW = 5
 
 
 @record
-class OddParameter(Record):
-    """A parameter in which one recording differs from the others.
-
-    Attributes:
-        name: Name of the parameter.
-        unit: Its unit; may be empty.
-        value: Value that the recording alone suggests [unit].
-        std: Standard deviation of this value [unit].
-        others: Value that the other recordings suggest [unit].
-        others_std: Standard deviation of that value [unit].
-        p: p-value of the difference, corrected for the number of recordings and parameters.
-        is_single: False for the entry of a vector or tensor, of which a percentage means nothing.
-    """
-
-    name: str
-    unit: str
-    value: float
-    std: float
-    others: float
-    others_std: float
-    p: float
-    is_single: bool = True
-
-    def __str__(self) -> str:
-        difference = difference_text(
-            self.value, self.others, self.others_std, self.unit, is_single=self.is_single
-        )
-        own, others = value_text(self.value, self.std), value_text(self.others, self.others_std)
-        numbers = f"{own} against {others} {self.unit}".rstrip()
-        return f"its {self.name} is {difference} that of the others ({numbers}, {p_text(self.p)})"
-
-
-@record
 class OddRecording(Record):
     """A recording that differs from all others.
 
@@ -110,14 +77,16 @@ class OddRecording(Record):
         index: Index of the recording.
         name: Its name.
         p: p-value, corrected for the number of tests.
-        parameters: Parameters in which it differs, the most significant one first; empty where only
-            combinations of parameters differ.
+        parameters: Names of the parameters in which it differs, the most significant one first;
+            empty where only combinations of parameters differ.
+        differences: How each of them differs, in words.
     """
 
     index: int
     name: str
     p: float
-    parameters: tuple[OddParameter, ...]
+    parameters: tuple[str, ...]
+    differences: tuple[str, ...]
 
     def __str__(self) -> str:
         if not self.parameters:
@@ -125,7 +94,7 @@ class OddRecording(Record):
                 f"{self.name} is odd: combinations of its parameters differ from those of the "
                 f"other recordings ({p_text(self.p)})"
             )
-        return f"{self.name} is odd: {'; '.join(str(parameter) for parameter in self.parameters)}"
+        return f"{self.name} is odd: {'; '.join(self.differences)}"
 
 
 @record
@@ -237,7 +206,7 @@ class RecordingComparison(Record):
                     "recording": odd.name,
                     "p": odd.p,
                     "words": str(odd),
-                    "parameters": [parameter.name for parameter in odd.parameters],
+                    "parameters": list(odd.parameters),
                 }
                 for odd in self.odd
             ],

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import field
 from typing import Any
 
 import numpy as np
 
 from mjfim.arrays import Array, record
 from mjfim.errors import first_ones
-from mjfim.records.base import NamedEnum, Record, ShownRecord
+from mjfim.records.base import NamedEnum, Record, ShownRecord, no_array
 from mjfim.records.design import TIE_TOLERANCE, Design
 from mjfim.records.estimate import Estimate
 from mjfim.records.trajectory import Labels, Recording
@@ -32,6 +33,8 @@ class MethodOutcome(NamedEnum):
 class MethodResult(Record):
     """The best control that one method found. All numbers are NaN if it found none.
 
+    The search of a baseline states the method, the control, its cost and how it was found.
+
     Attributes:
         method: Key of the method.
         title: Name of the method in reports.
@@ -52,18 +55,18 @@ class MethodResult(Record):
     """
 
     method: str
-    title: str
-    outcome: MethodOutcome
-    control: Array | None
-    cost: float
-    criterion: float
-    std: Array
-    min_eigenvalue: float
-    worst_relative_std: float
-    seconds: float
-    steps: int
-    margins: dict[str, float]
-    relative_margins: dict[str, float]
+    title: str = ""
+    outcome: MethodOutcome = MethodOutcome.NONE
+    control: Array | None = None
+    cost: float = np.nan
+    criterion: float = np.nan
+    std: Array = no_array()
+    min_eigenvalue: float = np.nan
+    worst_relative_std: float = np.nan
+    seconds: float = 0.0
+    steps: int = 0
+    margins: dict[str, float] = field(default_factory=dict)
+    relative_margins: dict[str, float] = field(default_factory=dict)
     found_by: str = ""
     note: str = ""
 

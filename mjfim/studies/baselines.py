@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 import scipy.signal
@@ -17,8 +18,8 @@ import scipy.signal
 from mjfim.arrays import Array, record
 from mjfim.excitation.design import consume
 from mjfim.excitation.initial_controls import series_of
-from mjfim.excitation.search.inside import LimitedCost, largest_share
-from mjfim.excitation.search.levels import DescentLevel, bandwidth_basis
+from mjfim.excitation.search.inside import largest_share
+from mjfim.excitation.search.levels import DescentLevel
 from mjfim.excitation.search.search import Search
 from mjfim.excitation.task import DesignTask
 from mjfim.excitation.task_parts import Known
@@ -26,6 +27,7 @@ from mjfim.experiment.schema import Experiment
 from mjfim.parallel import one_blas_thread, pool_stop_token
 from mjfim.parallel.budget import Budget, StopToken
 from mjfim.records.events import DesignEvent
+from mjfim.records.studies import MethodResult
 
 # Largest number of harmonics of a parametric multisine.
 MAX_HARMONICS = 30
@@ -237,30 +239,23 @@ class BaselineSearch:
     added: Known | None = None
     threads: int | None = None
 
+    def generator(self) -> np.random.Generator:
+        """Random generator of this search."""
+        return np.random.default_rng((self.seed, *self.part))
 
-@record
-class SearchResult:
-    """The best control that a search has found.
-
-    Attributes:
-        control: (N, nu) control [u-unit]; None without one.
-        cost: J of the control; infinite where it violates a limit.
-        found_by: Name of the series.
-        seconds: Time of the search [s].
-        steps: MuJoCo steps of the search.
-    """
-
-    control: Array | None = None
-    cost: float = np.inf
-    found_by: str = ""
-    seconds: float = 0.0
-    steps: int = 0
+    def task(self, **tables: Any) -> DesignTask:
+        """The task of the experiment with changed tables."""
+        return DesignTask.resolve(
+            self.experiment.replace(**tables),
+            threads=self.threads,
+            added=self.added,
+        )
 
 
 @one_blas_thread()
 def run_baseline(
     search: BaselineSearch, callback: SearchCallback | None = None, stop: StopToken | None = None
-) -> SearchResult:
+) -> MethodResult:
     """Run a baseline until its time is over. An executor can call this in a worker process.
 
     Args:
@@ -269,9 +264,9 @@ def run_baseline(
         stop: Ends the search early; None for the request of the pool of this process.
     """
     budget = Budget(seconds=search.seconds, stop=stop or pool_stop_token())
-    task = DesignTask.resolve(search.experiment, threads=search.threads, added=search.added)
-    found, steps = METHODS[search.method](search, task, budget, callback or (lambda cost: None))
-    return replace(found, seconds=budget.seconds_used, steps=steps)
+    task = search.task()
+    found = METHODS[search.method](search, task, budget, callback or (lambda cost: None))
+    return replace(found, seconds=budget.seconds_used)
 
 
 # ---- random search
@@ -285,23 +280,24 @@ def _search_at_random(
     *,
     wave: Callable[[ExcitationSettings, Array], Array],
     counts: tuple[int, int],
-) -> tuple[SearchResult, int]:
+) -> MethodResult:
     """Search over the numbers of an excitation, about the best ones or everywhere.
 
     counts: Numbers that all actuators share, and those of each actuator.
     """
     task = stated.relaxed() if stated.is_limited else stated
-    cost = LimitedCost(level=DescentLevel(task, search.combinations))
-    rng = np.random.default_rng((search.seed, *search.part))
-    settings = _settings(cost)
+    level = DescentLevel(task, search.combinations)
+    rng = search.generator()
+    settings = _settings(level)
     count = 1 + counts[0] + counts[1] * settings.nu
-    basis, window = bandwidth_basis(task, task.t), task.fade(task.samples)
-    bounds = cost.level.constraints.control.bounds
+    basis, window = task.bandwidth_basis(task.t), task.fade(task.samples)
+    bounds = level.constraints.control.bounds
     is_bounded = bool(np.isfinite(bounds.lower).all())
     largest = LARGEST_BOUNDED_SCALE if is_bounded else LARGEST_UNBOUNDED_SCALE
     has_weights = bool(task.control_weight.any() or task.tracking.any()) or not task.is_limited
 
-    best, found, spread = np.zeros(0), SearchResult(), FIRST_SPREAD
+    best, spread = np.zeros(0), FIRST_SPREAD
+    found = MethodResult(method=search.method, cost=np.inf)
     while budget.exhausted is None:
         show(found.cost)
         # The first number is the size, which matters where weights in the cost decide about it.
@@ -316,15 +312,15 @@ def _search_at_random(
             deviation = basis @ np.linalg.lstsq(basis, deviation)[0]
         scale: float | None = 1.0
         if task.is_limited:
-            scale = largest_share(partial(_keeps_share, cost, deviation), budget)
+            scale = largest_share(partial(_keeps_share, level, deviation), budget)
         if scale is None:
             continue
         if has_weights:
             scale *= SMALLEST_WEIGHTED_SCALE ** (1.0 - numbers[0])
         control = task.centre + scale * deviation
-        values = cost.level.values(control)
-        is_inside = values is not None and cost.level.constraints.is_feasible(values)
-        point = cost.point_along(values) if is_inside or not task.is_limited else None
+        values = level.values(control)
+        is_inside = values is not None and level.constraints.is_feasible(values)
+        point = level.point_along(values) if is_inside or not task.is_limited else None
         J = np.inf if point is None else point.cost
 
         # Widen the local search after a success, narrow it after a failure.
@@ -332,22 +328,22 @@ def _search_at_random(
             factor = SPREAD_AFTER_SUCCESS if found.cost > J else SPREAD_AFTER_FAILURE
             spread = np.clip(spread * factor, *SPREAD_RANGE)
         if found.cost > J:
-            best, found = numbers, SearchResult(control=control, cost=J)
-    return found, task.plant.engine_steps
+            best, found = numbers, replace(found, control=control, cost=J)
+    return replace(found, steps=task.plant.engine_steps)
 
 
-def _keeps_share(cost: LimitedCost, deviation: Array, share: float) -> bool:
+def _keeps_share(level: DescentLevel, deviation: Array, share: float) -> bool:
     """Check whether a share of a deviation from the centre keeps the limits."""
-    return cost.nearly_keeps(cost.level.task.centre + share * deviation)
+    return level.nearly_keeps(level.task.centre + share * deviation)
 
 
-def _settings(cost: LimitedCost) -> ExcitationSettings:
+def _settings(level: DescentLevel) -> ExcitationSettings:
     """Settings of the excitations of an experiment."""
-    task = cost.level.task
+    task = level.task
     experiment = task.experiment
     bandwidth = experiment.limits.bandwidth
     fastest = min(bandwidth or np.inf, 0.25 * experiment.rate, MAX_CYCLES / task.horizon)
-    is_smooth = cost.level.constraints.rate is not None or bandwidth is not None
+    is_smooth = level.constraints.rate is not None or bandwidth is not None
     return ExcitationSettings(
         t=task.t,
         horizon=task.horizon,
@@ -373,11 +369,15 @@ def _optimise(
     show: SearchCallback,
     *,
     harmonics: int | None,
-) -> tuple[SearchResult, int]:
+) -> MethodResult:
     """Optimise Fourier series of some harmonics, or B-splines where `harmonics` is None."""
     level = DescentLevel(stated, search.combinations)
-    first = level.problem.point(stated.initial)
-    optimiser = Search(stage=level, first=first, budget=budget, keeps_curves=True)
+    optimiser = Search(
+        stage=level,
+        first=level.problem.point(stated.initial),
+        budget=budget,
+        keeps_curves=True,
+    )
     best = np.inf
 
     def watch(event: DesignEvent) -> None:
@@ -386,19 +386,18 @@ def _optimise(
             best = min(best, event.row.cost)
         show(best)
 
-    rng = np.random.default_rng((search.seed, *search.part))
     part, parts = search.part
-    starts = list(series_of(stated, rng, harmonics))[part::parts]
+    starts = list(series_of(stated, search.generator(), harmonics))[part::parts]
     results = consume(optimiser.run(starts), watch)
-    steps = optimiser.steps
+    nothing = MethodResult(method=search.method, cost=np.inf, steps=optimiser.steps)
     found = min(results, key=lambda each: (each.cost, each.rank), default=None)
     if found is None:
-        return SearchResult(), steps
+        return nothing
     control = found.over_horizon if found.best is None else found.best
-    return SearchResult(control=control, cost=found.cost, found_by=found.name), steps
+    return replace(nothing, control=control, cost=found.cost, found_by=found.name)
 
 
-Method = Callable[[BaselineSearch, DesignTask, Budget, SearchCallback], tuple[SearchResult, int]]
+Method = Callable[[BaselineSearch, DesignTask, Budget, SearchCallback], MethodResult]
 
 # The baselines by their keys.
 METHODS: dict[str, Method] = {

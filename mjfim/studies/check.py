@@ -25,10 +25,10 @@ from mjfim.excitation.evaluation import (
     require_evaluated,
 )
 from mjfim.excitation.initial_controls import initial_controls_of
+from mjfim.excitation.limits.limits import ReleaseSpace
 from mjfim.excitation.limits.verification import all_violations_of, require_feasible_start
 from mjfim.excitation.objective import DesignPoint, DesignProblem
 from mjfim.excitation.rehearsal import rehearsed, steps_along
-from mjfim.excitation.release_space import ReleaseSpace
 from mjfim.excitation.search.levels import regulator_for, require_coarse_factor
 from mjfim.excitation.sensors import sensing_along
 from mjfim.excitation.task import (
@@ -82,7 +82,7 @@ def self_test(
     task: DesignTask,
     problem: DesignProblem,
     point: DesignPoint,
-    stop: Callable[[], bool] = lambda: False,
+    stop: Callable[[], bool],
 ) -> SelfTest:
     """Test the derivatives about one trajectory.
 
@@ -96,38 +96,28 @@ def self_test(
         SimulationDivergedError: The trajectory diverges when the parameters change a little.
     """
     trajectory = point.trajectory
-    if trajectory is None or point.sensitivity is None:
+    sensitivity = point.sensitivity
+    if trajectory is None or sensitivity is None:
         raise SimulationDivergedError("the trajectory diverges when the parameters change a little")
 
-    model = task.system.model_at(task.theta)
-    sensitivity = point.sensitivity
-
-    def slope() -> float:
-        """The error of the slope; infinite where a motion is too unstable for a direction."""
-        try:
-            return slope_error(task, problem, point)
-        except np.linalg.LinAlgError:
-            return np.inf
-
-    tests: dict[str, Callable[[], Any]] = {
-        "recursion": lambda: recursion_error(task, trajectory, sensitivity),
-        "slope": slope,
+    tests = {
+        "recursion": partial(recursion_error, task, trajectory, sensitivity),
+        "slope": partial(slope_error, task, problem, point),
     }
     tested = SelfTest(recursion=np.nan, slope=np.nan, finished=False)
     for number, (name, error) in enumerate(tests.items()):
         if stop():
             return tested
-        # A state does not show what control laws remember: there is no recursion and no slope.
-        is_possible = task.plant.laws is None
         begin_stage(f"testing the derivatives: {name}", number, len(tests))
-        found: dict[str, Any] = {name: error() if is_possible else 0.0}
+        # A state does not show what control laws remember: there is no recursion and no slope.
+        found: dict[str, Any] = {name: error() if task.plant.laws is None else 0.0}
         tested = replace(tested, **found)
     tested = replace(tested, finished=True)
 
     # Where contacts, dry friction or limits act, derivatives differ from differences.
     if tested.passed:
         return tested
-    active = first_active_constraint(model, trajectory)
+    active = first_active_constraint(task.system.model_at(task.theta), trajectory)
     return tested if active is None else replace(tested, acting=active[1])
 
 
@@ -177,8 +167,9 @@ def slope_error(task: DesignTask, problem: DesignProblem, point: DesignPoint) ->
         point: Trajectory with the cost there.
 
     Returns:
-        Relative error; NaN where the cost is infinite, infinite where a moved trajectory diverges.
-        It is 0 for a model without actuators, whose cost has no slope along a control.
+        Relative error; NaN where the cost is infinite, infinite where a moved trajectory diverges,
+        or where the motion is too unstable for a direction. It is 0 for a model without actuators,
+        whose cost has no slope along a control.
     """
     if not np.isfinite(point.cost) or point.trajectory is None:
         return float("nan")
@@ -186,12 +177,15 @@ def slope_error(task: DesignTask, problem: DesignProblem, point: DesignPoint) ->
         return 0.0
 
     expansion = problem.expand(point)
-    K = regulator_for(task).gain(expansion)
     # Without a weight on every control, the direction would divide by zero.
     weights, metric = task.control_weight, regulator_for(task).R
     if (weights > 0.0).all():
         metric = np.diag(weights) * task.dt
-    zeta = LBFGS(metric)(expansion, K)
+    try:
+        K = regulator_for(task).gain(expansion)
+        zeta = LBFGS(metric)(expansion, K)
+    except np.linalg.LinAlgError:
+        return np.inf
 
     # Scale the curve so that its largest entry is one difference step of the plant.
     sizes = task.plant.derivatives.difference_sizes(point.trajectory)

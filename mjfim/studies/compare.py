@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import field, replace
+from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
-from mjfim.arrays import Array, record
+from mjfim.arrays import Array
 from mjfim.errors import (
     ExperimentError,
     NoResultError,
@@ -20,10 +21,11 @@ from mjfim.excitation.design import design_budget, design_task
 from mjfim.excitation.evaluation import designable, point_at_stated_rate
 from mjfim.excitation.limits.verification import (
     SAME_STATE_TOLERANCE,
+    Verification,
     require_feasible_start,
     verify,
 )
-from mjfim.excitation.search.inside import InsideSearch, LimitedCost
+from mjfim.excitation.search.inside import InsideSearch
 from mjfim.excitation.search.levels import DescentLevel
 from mjfim.excitation.task import DesignTask
 from mjfim.excitation.task_parts import require_controls
@@ -38,7 +40,8 @@ from mjfim.plant.active_constraints import saturated_actuators
 from mjfim.records.design import Status
 from mjfim.records.events import Callback, DesignEvent, Event, StudyEvent, shown_progress
 from mjfim.records.studies import DESIGN, Comparison, MethodOutcome, MethodResult
-from mjfim.studies.baselines import METHODS, TITLES, BaselineSearch, SearchResult, run_baseline
+from mjfim.records.trajectory import Trajectory
+from mjfim.studies.baselines import METHODS, TITLES, BaselineSearch, SearchCallback, run_baseline
 
 # Names of all methods for the user.
 METHOD_TITLES = {**TITLES, DESIGN: "mjfim's design"}
@@ -114,20 +117,23 @@ def compare(
         shown_progress("comparing", callback, progress) as show,
     ):
         for i, method in enumerate(chosen):
-            run = _MethodRun(
-                search=replace(search, method=method),
+            event = StudyEvent(
+                study="compare",
+                part=METHOD_TITLES[method],
                 index=i,
                 count=len(chosen),
-                callback=show,
-                executor=workers,
-                stop=token,
-                identifiability=identifiability,
+                share=0.0,
             )
-            row = run.design(evaluation) if method == DESIGN else run.baseline(evaluation)
+            report = partial(_report, show, event, time.monotonic(), seconds)
+            own = replace(search, method=method)
+            if method == DESIGN:
+                found = _designed(own, show, report, workers, token, identifiability)
+            else:
+                found = _by_baseline(own, report, workers, token, task.system)
 
             # An interrupted method is kept with its best control so far.
-            if row is not None:
-                rows.append(row)
+            if found is not None:
+                rows.append(evaluation.result(found))
             if token.requested:
                 break
 
@@ -179,115 +185,101 @@ def chosen_methods(system: System, methods: Sequence[str] | None) -> tuple[str, 
     return chosen
 
 
-@record
-class _MethodRun:
-    """One method of a comparison."""
+def _report(
+    callback: Callback | None, event: StudyEvent, begun: float, seconds: float, cost: float
+) -> None:
+    """Report the used share of the time of a method [s], and the lowest J so far."""
+    if callback is not None:
+        share = min((time.monotonic() - begun) / seconds, 1.0)
+        callback(replace(event, share=share, message=f"best J {cost:.5g}"))
 
-    search: BaselineSearch
-    index: int
-    count: int
-    callback: Callback | None
-    executor: ExecutorLike | None
-    stop: StopToken
-    identifiability: Identifiability
-    begun: float = field(default_factory=time.monotonic)
 
-    def report(self, cost: float) -> None:
-        """Report the used share of the time and the lowest J so far."""
-        if self.callback is None:
-            return
-        event = StudyEvent(
-            study="compare",
-            part=METHOD_TITLES[self.search.method],
-            index=self.index,
-            count=self.count,
-            share=min((time.monotonic() - self.begun) / self.search.seconds, 1.0),
-            message=f"best J {cost:.5g}",
+def _by_baseline(
+    search: BaselineSearch,
+    report: SearchCallback,
+    executor: Workers | None,
+    stop: StopToken,
+    system: System,
+) -> MethodResult | None:
+    """Run a baseline; None where it was stopped without a control."""
+    found: MethodResult | None
+    if executor is None:
+        found = run_baseline(search, report, stop)
+    else:
+        found = _divided(search, executor, stop, system)
+    # An interrupted search is compared by its best control so far.
+    if found is None or (stop.requested and found.control is None):
+        return None
+    return replace(found, note=INTERRUPTED_NOTE if stop.requested else "")
+
+
+def _divided(
+    search: BaselineSearch, workers: Workers, stop: StopToken, system: System
+) -> MethodResult | None:
+    """Run a part of a baseline in every worker; a part that is lost is left out."""
+    count = workers.count
+    experiment = for_workers(search.experiment, system.source)
+    parts = [
+        replace(search, experiment=experiment, threads=1, part=(i, count)) for i in range(count)
+    ]
+    outcomes = carry_out(workers, run_baseline, parts, Budget(stop=stop))
+    results = [result for _, found in outcomes for result in found]
+    if not results:
+        return None
+    return replace(
+        min(results, key=lambda result: result.cost),
+        seconds=max(result.seconds for result in results),
+        steps=sum(result.steps for result in results),
+    )
+
+
+def _designed(
+    search: BaselineSearch,
+    callback: Callback | None,
+    report: SearchCallback,
+    executor: Workers | None,
+    stop: StopToken,
+    identifiability: Identifiability,
+) -> MethodResult | None:
+    """Design with the time of the method; None where it was stopped before it had a result."""
+    best = np.inf
+
+    def watch(event: Event) -> None:
+        nonlocal best
+        if callback is not None:
+            callback(event)
+        if isinstance(event, DesignEvent):
+            best = best if event.row.margin < 0.0 else min(best, event.row.cost)
+            report(best)
+
+    begun = time.monotonic()
+    try:
+        task = search.task(
+            descent={"seconds": search.seconds, "max_iterations": UNLIMITED_ITERATIONS}
         )
-        self.callback(event)
-
-    def baseline(self, evaluation: MethodEvaluation) -> MethodResult | None:
-        """Run a baseline and evaluate its control; None where it was stopped without one."""
-        result: SearchResult | None
-        if self.executor is None:
-            result = run_baseline(self.search, self.report, self.stop)
-        else:
-            result = self._divided(self.executor, evaluation.task.system)
-        # An interrupted search is compared by its best control so far.
-        interrupted = self.stop.requested
-        if result is None or (interrupted and result.control is None):
-            return None
-        note = INTERRUPTED_NOTE if interrupted else ""
-        return evaluation.result(self.search.method, result, note)
-
-    def _divided(self, executor: ExecutorLike, system: System) -> SearchResult | None:
-        """Run a part of a baseline in every worker; a part that is lost is left out."""
-        count = Workers.of(executor).count
-        experiment = for_workers(self.search.experiment, system.source)
-        parts = [
-            replace(self.search, experiment=experiment, threads=1, part=(i, count))
-            for i in range(count)
-        ]
-        outcomes = list(carry_out(executor, run_baseline, parts, Budget(stop=self.stop)))
-        results = [outcome.result for outcome in outcomes if not outcome.is_lost]
-        if not results:
-            return None
-        return replace(
-            min(results, key=lambda result: result.cost),
-            seconds=max(result.seconds for result in results),
-            steps=sum(result.steps for result in results),
+        design = design_task(
+            task,
+            callback=watch,
+            executor=executor,
+            budget=design_budget(task, stop),
+            identifiability=identifiability,
         )
+    except SimulationDivergedError:
+        return MethodResult(method=DESIGN, seconds=time.monotonic() - begun)
+    except NoResultError:
+        return None
 
-    def design(self, evaluation: MethodEvaluation) -> MethodResult | None:
-        """Design with the time of the method, and evaluate the result.
-
-        Returns:
-            The result; None where the design was stopped before it had one.
-        """
-        best = np.inf
-
-        def watch(event: Event) -> None:
-            nonlocal best
-            if self.callback is not None:
-                self.callback(event)
-            if isinstance(event, DesignEvent):
-                best = best if event.row.margin < 0.0 else min(best, event.row.cost)
-                self.report(best)
-
-        iterations = max(self.search.experiment.descent.max_iterations, UNLIMITED_ITERATIONS)
-        stated = self.search.experiment.replace(
-            descent={"seconds": self.search.seconds, "max_iterations": iterations}
-        )
-        try:
-            task = DesignTask.resolve(
-                stated,
-                threads=self.search.threads,
-                added=self.search.added,
-            )
-            design = design_task(
-                task,
-                callback=watch,
-                executor=self.executor,
-                budget=design_budget(task, self.stop),
-                identifiability=self.identifiability,
-            )
-        except SimulationDivergedError:
-            nothing = SearchResult(seconds=time.monotonic() - self.begun)
-            return evaluation.result(DESIGN, nothing)
-        except NoResultError:
-            return None
-
-        result = SearchResult(
-            control=design.trajectory.ctrl,
-            cost=design.final.cost,
-            found_by=design.found_by,
-            seconds=design.seconds,
-            steps=design.steps,
-        )
-        # A design that its time ended needs no remark about its status.
-        status = design.status.value.split(":")[0].split(";")[0]
-        is_late = design.status is Status.MAX_ITERATIONS
-        return evaluation.result(DESIGN, result, "" if is_late else status)
+    # A design that its time ended needs no remark about its status.
+    is_late = design.status is Status.MAX_ITERATIONS
+    return MethodResult(
+        method=DESIGN,
+        control=design.trajectory.ctrl,
+        cost=design.final.cost,
+        found_by=design.found_by,
+        seconds=design.seconds,
+        steps=design.steps,
+        note="" if is_late else design.status.value.split(":")[0].split(";")[0],
+    )
 
 
 class MethodEvaluation:
@@ -307,51 +299,42 @@ class MethodEvaluation:
         count = len(task.parameters.interest) if combinations is None else combinations.shape[1]
         self.nats = cost.information * count if cost.criterion == "D" else 0.0
 
-    def result(self, method: str, found: SearchResult, note: str = "") -> MethodResult:
+    def result(self, found: MethodResult) -> MethodResult:
         """Evaluate the control that a method has found.
 
         The control of a baseline that violates a limit on the user's model is shrunk until no limit
         is violated. The control of a design is evaluated without changes.
 
         Args:
-            method: Key of the method.
             found: The best control of its search.
-            note: Remark about the result.
         """
         control = found.control
-        nothing = MethodResult(
-            method=method,
-            title=METHOD_TITLES[method],
+        nothing = replace(
+            found,
+            title=METHOD_TITLES[found.method],
             outcome=MethodOutcome.NOTHING if found.steps else MethodOutcome.NONE,
             control=None,
             cost=np.nan,
-            criterion=np.nan,
-            std=np.full(len(self.task.parameters), np.nan),
-            min_eigenvalue=np.nan,
-            worst_relative_std=np.nan,
-            seconds=found.seconds,
-            steps=found.steps,
-            margins={},
-            relative_margins={},
-            note=note,
+            std=np.full_like(self.task.theta, np.nan),
+            found_by="",
         )
         if control is None:
             return nothing
 
         evaluated = self._evaluate(nothing, found, control)
-        if method == DESIGN or evaluated.outcome is not MethodOutcome.OUTSIDE:
+        if found.method == DESIGN or evaluated.outcome is not MethodOutcome.OUTSIDE:
             return evaluated
 
         # A control that violates a limit of the unmodified model is made smaller.
         centre = self.task.centre
-        relaxed = LimitedCost(level=DescentLevel(self.task.relaxed(), self.stage.basis))
+        relaxed = DescentLevel(self.task.relaxed(), self.stage.basis)
         inside = InsideSearch(relaxed, 0).largest(centre, control - centre, Budget())
         if inside is None:
             return evaluated
-        remarks = filter(None, [note, f"shrunk to {100.0 * inside.share:.3g} %"])
+        remarks = filter(None, [found.note, f"shrunk to {100.0 * inside.share:.3g} %"])
         return self._evaluate(replace(nothing, note=", ".join(remarks)), found, inside.control)
 
-    def _evaluate(self, nothing: MethodResult, found: SearchResult, control: Array) -> MethodResult:
+    def _evaluate(self, nothing: MethodResult, found: MethodResult, control: Array) -> MethodResult:
         """Evaluate a control without changing it; `nothing` where the simulation diverges.
 
         Args:
@@ -359,30 +342,17 @@ class MethodEvaluation:
             found: The result of the search.
             control: (N, nu) its control, perhaps made smaller [u-unit].
         """
-        task, note = self.task, nothing.note
         point = point_at_stated_rate(self.stage, control)
         if point is None or point.trajectory is None:
             return nothing
         if point.criterion is None or point.information is None:
             return nothing
 
-        # The outcome of the method, and a note for the user.
-        verification = verify(task, point.trajectory)
-        saturated = saturated_actuators(task.system.model_at(task.theta), point.trajectory)
-        outcome = MethodOutcome.INSIDE if verification.is_feasible else MethodOutcome.OUTSIDE
-        if outcome is MethodOutcome.OUTSIDE and not np.isfinite(found.cost):
-            outcome = MethodOutcome.NOTHING
-
-        if outcome is MethodOutcome.INSIDE and saturated:
-            outcome = MethodOutcome.CLAMPED
-            note = f"forcerange clamps {listed(saturated)}"
-        elif verification.deviation > SAME_STATE_TOLERANCE:
-            note = (
-                f"a clamp, stop or contact acts: the states deviate by {verification.deviation:.2g}"
-            )
-
+        verification = verify(self.task, point.trajectory)
+        outcome, note = self._outcome(found, point.trajectory, verification)
         smallest = float(point.criterion.eigenvalues[0])
-        worst = (smallest * task.system.measure_rate) ** -0.5 if smallest > 0.0 else np.inf
+        rate = self.task.system.measure_rate
+        worst = (smallest * rate) ** -0.5 if smallest > 0.0 else np.inf
         return replace(
             nothing,
             outcome=outcome,
@@ -395,5 +365,23 @@ class MethodEvaluation:
             margins=verification.margins,
             relative_margins=verification.relative_margins,
             found_by=found.found_by,
-            note=note,
+            note=note or nothing.note,
         )
+
+    def _outcome(
+        self, found: MethodResult, trajectory: Trajectory, verification: Verification
+    ) -> tuple[MethodOutcome, str]:
+        """The outcome of a method, and what a clamp, a stop or a contact does; may be empty."""
+        if not verification.is_feasible and not np.isfinite(found.cost):
+            outcome = MethodOutcome.NOTHING
+        else:
+            is_inside = verification.is_feasible
+            outcome = MethodOutcome.INSIDE if is_inside else MethodOutcome.OUTSIDE
+
+        saturated = saturated_actuators(self.task.system.model_at(self.task.theta), trajectory)
+        if outcome is MethodOutcome.INSIDE and saturated:
+            return MethodOutcome.CLAMPED, f"forcerange clamps {listed(saturated)}"
+        if verification.deviation > SAME_STATE_TOLERANCE:
+            deviation = f"{verification.deviation:.2g}"
+            return outcome, f"a clamp, stop or contact acts: the states deviate by {deviation}"
+        return outcome, ""

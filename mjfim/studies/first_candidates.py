@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import field, replace
 from functools import partial
@@ -15,7 +15,7 @@ import numpy as np
 
 from mjfim.arrays import Array, record
 from mjfim.errors import ExperimentError, ModelError, first_ones, unknown
-from mjfim.experiment.time_grid import rates_near, whole_number
+from mjfim.experiment.signals import rates_near, whole_number
 from mjfim.model.coordinates import joint_dofs, joint_names
 from mjfim.model.elements import (
     actuator_force_sizes,
@@ -463,16 +463,16 @@ def _last_bodies(model: Any, families: int) -> list[tuple[int, int]]:
         depth[body] = depth[model.body_parentid[body]] + model.body_jntnum[body]
     moving = [
         body
-        for body in range(1, model.nbody)
-        if depth[body] and model.body_mass[body] > 0.0 and element_name(model, "body", body)
+        for body in np.flatnonzero(depth).tolist()
+        if model.body_mass[body] > 0.0 and element_name(model, "body", body)
     ]
 
     # Fingers and markers are too light to matter.
     typical = np.median(model.body_mass[moving]) if moving else 0.0
-    alike: dict[tuple[int, float], list[int]] = {}
+    alike = defaultdict(list)
     for body in moving:
         if model.body_mass[body] >= SMALL_MASS * typical:
-            alike.setdefault((-depth[body], -rounded(model.body_mass[body], 6)), []).append(body)
+            alike[-depth[body], -rounded(model.body_mass[body], 6)].append(body)
     last = sorted(alike.items())[:families]
     return [(body, i) for i, (_, bodies) in enumerate(last) for body in bodies]
 
@@ -525,12 +525,14 @@ def _inertia(model: Any) -> Iterator[Candidate]:
 def _joint_fields(model: Any, group: Group, period: float) -> Iterator[Candidate]:
     """Fields of joints; those that are zero in the model have a natural size."""
     forces = STRENGTH_SHARE * _strengths(model, period)
-    sizes, speed = position_sizes(model), 2.0 * np.pi / period
+    sizes = position_sizes(model)
+    speed = 2.0 * np.pi / period
     for quantity, array, meaning in JOINT_FIELDS[group]:
         # A force of friction, over a natural speed or acceleration.
         power = {"damping": 1, "armature": 2}.get(quantity, 0)
         for joint in range(model.njnt):
-            name, dof = element_name(model, "joint", joint), model.jnt_dofadr[joint]
+            name = element_name(model, "joint", joint)
+            dof = model.jnt_dofadr[joint]
             value = float(getattr(model, array)[dof])
             size = float(forces[dof] / speed**power / sizes[dof] ** (power > 0))
             if name and (value > 0.0 or joint_dofs(model, joint) == 1):

@@ -653,7 +653,8 @@ class _Refinement:
     def _predictable_samples(self, system: System, draft: Proposal) -> int:
         """Samples of the first motion until a small disturbance of the start has grown too much."""
         task = self._task(system, draft)
-        model, substeps = self.source.model, task.system.grid.substeps
+        model = self.source.model
+        substeps = task.system.grid.substeps
         controls = np.repeat(task.control, substeps, axis=0)
         sizes = position_sizes(model)
         rng = np.random.default_rng(0)
@@ -661,15 +662,15 @@ class _Refinement:
 
         # A random direction has a share of the one that grows most. Only positions count:
         # velocities grow at first where a servo is stiff.
-        samples, largest = len(undisturbed), LARGEST_AMPLIFICATION / np.sqrt(model.nv)
+        samples = len(undisturbed)
+        largest = DISTURBANCE * LARGEST_AMPLIFICATION / np.sqrt(model.nv)
         for _ in range(DISTURBANCES):
             direction = rng.standard_normal(model.nv)
             moved = DISTURBANCE * sizes * direction / np.linalg.norm(direction)
             disturbed = played(model, draft.start, controls, moved)[0][substeps::substeps]
-            most = largest * DISTURBANCE
-            samples = _samples_near(model, undisturbed[:samples], disturbed, sizes, most)
-        least = round(SHORTEST_MOTION * draft.times.period * draft.times.rate)
-        return min(max(samples, least), draft.times.samples)
+            samples = _samples_near(model, undisturbed[:samples], disturbed, sizes, largest)
+        times = draft.times
+        return min(max(samples, round(SHORTEST_MOTION * times.period * times.rate)), times.samples)
 
     def _identified(self, draft: Proposal) -> Sequence[int]:
         """Indices of the candidates that the chirp or the release identifies together.

@@ -642,15 +642,19 @@ def first_amplitudes(
             moved = np.abs(influence[:, i]) > 0.0
             amplitudes[i] = (wanted[moved] / np.abs(influence[moved, i])).min()
 
-    # The joint follows the control of a position servo.
+    for control, amplitude in _servo_amplitudes(model, distance):
+        amplitudes[control] = amplitude
+    return two_digits(amplitudes)
+
+
+def _servo_amplitudes(model: Any, distance: Array) -> Iterator[tuple[int, float]]:
+    """Controls without a range that a joint follows, with the amplitudes for its (nv,) distance."""
     for actuator in range(model.nactuator):
         control = model.actuator_ctrladr[actuator]
         joint = commanded_joint(model, actuator)
         if joint is not None and not model.actuator_ctrllimited[control]:
             gear = abs(actuator_gear(model, actuator))
-            amplitudes[control] = gear * distance[model.jnt_dofadr[joint]]
-
-    return two_digits(amplitudes)
+            yield control, gear * distance[model.jnt_dofadr[joint]]
 
 
 def two_digits(values: Array) -> Array:

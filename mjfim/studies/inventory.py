@@ -193,7 +193,8 @@ def stated_experiment(experiment: Experiment) -> StatedExperiment:
     else:
         limits = DesignTask.of(system).limits
 
-    parameters, outputs = system.parameters, system.outputs.outputs
+    parameters = system.parameters
+    outputs = system.outputs.outputs
     return StatedExperiment(
         source=experiment.source,
         model=str(system.model_path),
@@ -208,7 +209,7 @@ def stated_experiment(experiment: Experiment) -> StatedExperiment:
         output_units={output.name: output.unit for output in outputs},
         controls=system.controls,
         limits=tuple(map(_listed, limits)),
-        controllers=laws_in_loop(system, system.parameters.guess, {}),
+        controllers=laws_in_loop(system, parameters.guess, {}),
         missing=tuple(missing),
         warnings=probable_degrees(experiment, system.source),
     )

@@ -100,8 +100,7 @@ class TrialSet:
                 return None
             step = self._own_step(theta[active], measured[active])
             theta[active] = np.where(np.isfinite(step), theta[active] + step, centre)
-            relative = np.nan_to_num(np.abs(step) / std, nan=np.inf)
-            active = active[relative.max(axis=1) >= CONVERGED_STEP]
+            active = active[~(np.abs(step) < CONVERGED_STEP * std).all(axis=1)]
             if not len(active):
                 break
 
@@ -109,8 +108,7 @@ class TrialSet:
         for i in active:
             if stop.requested:
                 return None
-            found = self._fitted(measured[i], centre)
-            theta[i] = np.nan if found is None else found
+            theta[i] = self._fitted(measured[i], centre)
         return theta
 
     @cached_property
@@ -122,7 +120,7 @@ class TrialSet:
             pseudo-inverse of the Jacobian [theta-unit].
         """
         theta = self._fitted(self.exact, self.system.parameters.guess)
-        theta = self.system.parameters.true if theta is None else theta
+        theta = self.system.parameters.true if np.isnan(theta).any() else theta
         predicted = self.system.plant.derivatives.predict(theta, self.ctrl)
         if predicted is None:
             raise SimulationDivergedError(
@@ -153,8 +151,8 @@ class TrialSet:
         step[usable] = (np.linalg.pinv(JT @ J, hermitian=True) @ (JT @ residual))[:, :, 0]
         return step
 
-    def _fitted(self, measured: Array, start: Array) -> Array | None:
-        """(p,) estimate of one trial by the general solver; None where the fit fails."""
+    def _fitted(self, measured: Array, start: Array) -> Array:
+        """(p,) estimate of one trial by the general solver; NaN where the fit fails."""
         noise = self.system.noise
         mask = noise.measured(len(self.ctrl)) > 0
         whitened = np.zeros(mask.shape)
@@ -167,7 +165,7 @@ class TrialSet:
             name="trial",
         )
         found = least_squares(FitProblem.of(self.system, [recording], data_only=True), start)
-        return found.unknowns.theta if found.success else None
+        return found.unknowns.theta if found.success else np.full_like(start, np.nan)
 
 
 # Smallest number of trials that are stepped together, where their memory and their time permit it,

@@ -505,17 +505,17 @@ class PayloadTask:
         return replace(system, parameters=replace(parameters, earlier_rows=rows))
 
     def _payload_tables(
-        self, values: dict[str, float] | None = None, inertia: float | None = None
+        self, guess: float | None = None, inertia: float | None = None
     ) -> dict[str, Any]:
         """Tables of the parameters of the payload.
 
         Args:
-            values: Values at which the search starts, by field; default: from the robot's sizes.
+            guess: Mass at which the search starts [kg]; None: from the robot's sizes.
             inertia: Assumed rotational inertia, known to as much [kg m²]; None where it is free.
         """
         mass, centre, length = self.start
         inertia_of_cube = mass * self._edge(mass) ** 2 / 6.0
-        start = {"mass": mass, "inertia": inertia_of_cube, **(values or {})}
+        start = {"mass": mass if guess is None else guess, "inertia": inertia_of_cube}
         start |= zip(AXES, centre, strict=True)
         tables = {}
         for field, name in self.names.items():
@@ -557,16 +557,14 @@ class PayloadTask:
             search: Its search.
         """
         names = fit.task.system.parameters.names
-        index = {field: names.index(name) for field, name in self.names.items()}
-        mass = self._plausible_mass(fit, index["mass"])
+        of_mass, of_inertia = (names.index(self.names[field]) for field in ("mass", "inertia"))
+        mass = self._plausible_mass(fit, of_mass)
         edge = self._edge(mass)
-        inertia = mass * edge**2 / 6.0
-        values = {field: float(fit.theta[j]) for field, j in index.items()}
-        system = self._system(known, self._payload_tables(values, inertia))
         start = np.array(fit.theta)
-        start[index["inertia"]] = inertia
+        start[of_inertia] = mass * edge**2 / 6.0
         begin_stage("fitting the payload with the inertia of a uniform cube")
-        task = FitTask.of(system, search.task.recordings)
+        tables = self._payload_tables(*start[[of_mass, of_inertia]].tolist())
+        task = FitTask.of(self._system(known, tables), search.task.recordings)
 
         # The length of the segments may be chosen already; the comparison of lengths still holds.
         if fit.horizons is not None:
@@ -574,8 +572,14 @@ class PayloadTask:
         found = fit_task(replace(search, task=replace(task, start=start)), checks_log=False)
 
         # Nominal is the model at which the whole search began.
-        task = replace(found.task, start=search.task.start)
-        return replace(found, task=task, horizons=fit.horizons or found.horizons), edge
+        return (
+            replace(
+                found,
+                task=replace(found.task, start=search.task.start),
+                horizons=fit.horizons or found.horizons,
+            ),
+            edge,
+        )
 
     def _payload(
         self, estimate: Estimate, known: KnownRobot, edge: float | None

@@ -360,12 +360,12 @@ class _Selector:
         # data best is chosen: the fit uses all data, so that it tells similar terms apart better.
         # Where no data tell terms apart, the first one of the candidates is chosen, so that the
         # choice does not depend on rounding errors.
-        clear = [pair for pair in extended if model.losses.reduction(pair[0].losses).is_clear]
+        clear = [pair for pair in extended if model.losses.is_clearly_above(pair[0].losses)]
         if not clear:
             self.steps.extend(step for _, step in extended)
             return None
         least = min(clear, key=lambda pair: pair[1].error)[0]
-        similar = [pair for pair in clear if not pair[0].losses.reduction(least.losses).is_clear]
+        similar = [pair for pair in clear if not pair[0].losses.is_clearly_above(least.losses)]
         highest = min(pair[0].penalised_cost for pair in similar) + EQUAL_COST
         chosen, step = next(pair for pair in similar if pair[0].penalised_cost <= highest)
         self.steps.extend(other for found, other in extended if found is not chosen)
@@ -379,7 +379,7 @@ class _Selector:
                 values={n: v for n, v in values_of(found).items() if n in stated},
             )
             for found, other in clear
-            if found is not chosen and not found.losses.reduction(chosen.losses).is_clear
+            if found is not chosen and not found.losses.is_clearly_above(chosen.losses)
         )
         count = len(chosen.terms)
         self.steps.append(
@@ -399,22 +399,21 @@ class _Selector:
             begin_stage("testing whether all added terms are needed")
             tried = [(term, self._without(model, term)) for term in tested]
             needless = [
-                (reduction, term, fewer)
+                (fewer.losses.reduction(model.losses), term, fewer)
                 for term, fewer in tried
-                if fewer is not None
-                and not (reduction := fewer.losses.reduction(model.losses)).is_clear
+                if fewer is not None and not fewer.losses.is_clearly_above(model.losses)
             ]
             if not needless:
                 break
-            reduction, term, model = min(needless, key=lambda found: found[0].mean)
+            (reduction, error), term, model = min(needless, key=lambda found: found[0])
             self._add(
                 Decision.REMOVED,
                 model,
                 term.description,
                 path=term.path,
                 joints=term.joints,
-                reduction=reduction.mean,
-                standard_error=reduction.standard_error,
+                reduction=reduction,
+                standard_error=error,
             )
         return model
 
@@ -446,16 +445,17 @@ class _Selector:
         simpler = self._assessed(self._fitted(changed))
         if simpler is None:
             return model
-        reduction = simpler.losses.reduction(model.losses)
+        reduction, standard_error = simpler.losses.reduction(model.losses)
         is_worse = (
-            reduction.is_clear or simpler.losses.error > WORSE_ERROR_RATIO * model.losses.error
+            simpler.losses.is_clearly_above(model.losses)
+            or simpler.losses.error > WORSE_ERROR_RATIO * model.losses.error
         )
         self._add(
             Decision.KEPT if is_worse else decision,
             simpler,
             words,
-            reduction=-reduction.mean,
-            standard_error=reduction.standard_error,
+            reduction=-reduction,
+            standard_error=standard_error,
         )
         return model if is_worse else simpler
 
@@ -489,13 +489,13 @@ class _Selector:
         extended = self._assessed(fit)
         if extended is None:
             return None
-        reduction = model.losses.reduction(extended.losses)
+        reduction, standard_error = model.losses.reduction(extended.losses)
         return extended, replace(
             step,
             decision=Decision.REJECTED,
             error=extended.losses.error,
-            reduction=reduction.mean,
-            standard_error=reduction.standard_error,
+            reduction=reduction,
+            standard_error=standard_error,
         )
 
     def _without(self, model: FittedModel, term: Term) -> FittedModel | None:

@@ -15,7 +15,7 @@ import mjfim
 from mjfim.excitation.limits.constraints import constraint_set_of
 from mjfim.excitation.task import DesignTask
 from mjfim.optimize.cost_models import relaxed_log_barrier
-from mjfim.optimize.structured_bfgs import StructuredBFGS
+from mjfim.optimize.directions import StructuredBFGS
 from tests.support.limits import (
     ARM,
     along_control,
@@ -165,15 +165,16 @@ def test_the_curvature_along_a_step_is_that_of_its_factors(name: str, tmp_path: 
     expansion = problem.expand(problem.point(task.control))
     barrier = expansion.barrier
     K, way = np.zeros((task.samples, 2, task.space.nx)), directions_of(task, 1, seed=6)[0]
-    weights, _, growth = barrier.curvature.along(expansion.lift(K, 0.0 * way), None)
-    assert growth == 1.0
+    weights, _, growth = barrier.curvature(expansion.lift(K, 0.0 * way), None)
+    weights = weights.scaled(barrier.mu)
+    assert (growth, barrier.mu) == (1.0, 3e-3)
     for each in "QRW":
         assert_allclose(getattr(weights, each), getattr(barrier.weights, each), rtol=1e-9)
 
     step = expansion.lift(K, way)
-    _, once, growth = barrier.curvature.along(step, None)
+    _, once, growth = barrier.curvature(step, None)
     assert 1.0 < growth == pytest.approx(max(each.max() for each in once))
-    _, again, growth = barrier.curvature.along(step, once)
+    _, again, growth = barrier.curvature(step, once)
     ratios = [b / a for a, b in zip(once, again, strict=True)]
     assert growth == pytest.approx(max(each.max() for each in ratios))
     # A search that follows it has another step, which is a descent as well.

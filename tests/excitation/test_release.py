@@ -14,7 +14,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 import mjfim
 from mjfim.errors import ExperimentError
 from mjfim.excitation.design import design_task
-from mjfim.excitation.release_space import ReleaseSpace
+from mjfim.excitation.limits.limits import ReleaseSpace
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System

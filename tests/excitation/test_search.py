@@ -16,8 +16,8 @@ from mjfim.excitation.limits.verification import verify
 from mjfim.excitation.search import search as search_module
 from mjfim.excitation.search.climb import Candidate, Move, tightened, without_jumps
 from mjfim.excitation.search.descent import Ground
-from mjfim.excitation.search.inside import InsideSearch, LimitedCost, largest_share
-from mjfim.excitation.search.levels import DescentLevel, bandwidth_basis, easier_level
+from mjfim.excitation.search.inside import InsideSearch, largest_share
+from mjfim.excitation.search.levels import DescentLevel, easier_level
 from mjfim.excitation.task import DesignTask
 from mjfim.parallel.budget import Budget, StopToken
 from mjfim.records.design import Status
@@ -26,9 +26,9 @@ from tests.support.limits import cart_inside
 from tests.support.stiff_servos import stiff_arm_task
 
 
-def cost_of(task: DesignTask) -> LimitedCost:
-    """The cost of a task within its limits."""
-    return LimitedCost(level=DescentLevel(task.relaxed(), None))
+def level_of(task: DesignTask) -> DescentLevel:
+    """The stated level of a task within its limits."""
+    return DescentLevel(task.relaxed(), None)
 
 
 # ---- the result at any moment
@@ -69,7 +69,7 @@ def test_a_stop_before_the_first_iterate_leaves_the_start(workers: int, tmp_path
 @pytest.mark.slow
 def test_a_start_outside_the_limits_is_scaled_and_improved(tmp_path: Path) -> None:
     task = stiff_arm_task(tmp_path, descent={"max_iterations": 2})
-    assert not cost_of(task).keeps(task.control)
+    assert not level_of(task).keeps(task.control)
     design = design_task(task)
     assert 0.0 < design.scaled_start.share < 1.0
     assert design.final.cost <= design.scaled_start.cost
@@ -97,16 +97,16 @@ def test_random_changes_lower_the_cost_within_limits(
 ) -> None:
     limits = {"control": {"force": [-5.0, 5.0]}, "position": {"slide": [-0.5, 0.5]}}
     task = cart_inside(tmp_path, limits={**limits, "bandwidth": bandwidth})
-    cost = cost_of(task)
-    first = InsideSearch(cost, 0).scaled(task.control, Budget())
-    better = InsideSearch(cost, 0).improvements(first, Budget(), patience=12)
+    level = level_of(task)
+    first = InsideSearch(level, 0).scaled(task.control, Budget())
+    better = InsideSearch(level, 0).improvements(first, Budget(), patience=12)
     found = list(itertools.islice(better, 3))
     costs = [first.cost, *(each.cost for each in found)]
     assert len(costs) > 1
     assert costs == sorted(costs, reverse=True)
-    basis = bandwidth_basis(task, task.t)
+    basis = task.bandwidth_basis(task.t)
     for each in found:
-        assert cost.keeps(each.control)
+        assert level.keeps(each.control)
         if basis is not None:
             fitted = basis @ np.linalg.lstsq(basis, each.deviation)[0]
             assert_allclose(fitted, each.deviation, atol=1e-9)
@@ -134,7 +134,7 @@ def test_limits_are_tightened_where_violated_and_released_where_well_kept() -> N
 
 def test_a_control_of_long_samples_has_no_steps_where_its_rate_is_limited(tmp_path: Path) -> None:
     limits = {"control": {"force": [-5.0, 5.0]}, "control_rate": {"force": 100.0}}
-    limited, free = cost_of(cart_inside(tmp_path, limits=limits)), cost_of(cart_inside(tmp_path))
+    limited, free = level_of(cart_inside(tmp_path, limits=limits)), level_of(cart_inside(tmp_path))
     steps = np.repeat(np.arange(25.0)[:, None], 4, axis=0)
     smooth = without_jumps(limited, steps, 4)
     assert_allclose(np.diff(smooth[2:-2], axis=0), 0.25)

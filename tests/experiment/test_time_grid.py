@@ -9,7 +9,7 @@ import pytest
 
 from mjfim.errors import ExperimentError
 from mjfim.experiment.schema import Experiment
-from mjfim.experiment.time_grid import TimeGrid
+from mjfim.experiment.signals import TimeGrid
 
 
 def experiment(rate: float, **keys: Any) -> Experiment:

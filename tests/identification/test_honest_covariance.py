@@ -18,7 +18,7 @@ from mjfim.identification.assessment.honest_covariance import (
     interval_std,
     with_honest_covariance,
 )
-from mjfim.records.estimate import Uncertainty
+from mjfim.identification.assessment.robust_covariance import Uncertainty
 from tests.identification.test_horizons import made_study
 from tests.identification.test_parameter_draws import COVARIANCE, STD, estimated
 from tests.support.cart_pendulum import cart_pendulum
@@ -78,8 +78,8 @@ def uncertainty(each: Array, between: Array, apart: tuple[int, ...]) -> Uncertai
         between=between,
         apart=apart,
         each=each,
-        blocks=10,
         draws=np.zeros((0, c)),
+        covariance=np.zeros((c, c)),
     )
 
 

@@ -11,7 +11,7 @@ from numpy.testing import assert_allclose
 
 import mjfim
 from mjfim.excitation.task import DesignTask
-from mjfim.identification.assessment.poor_fit import amplifications, sentence_about_instability
+from mjfim.identification.assessment.report import amplifications, sentence_about_instability
 from tests.range.plants import PLANTS, Setting
 
 

@@ -15,13 +15,13 @@ from scipy import stats
 from scipy.signal import lfilter
 
 from mjfim.identification.assessment.robust_covariance import (
+    Uncertainty,
     block_length,
     covering_covariance,
     merge_blocks,
     robust_uncertainty,
 )
 from mjfim.optimize.condensed_least_squares import Condensed
-from mjfim.records.estimate import Uncertainty
 from tests.support.numerics import Array
 
 # Rows of a block of the linearisation.
@@ -208,7 +208,6 @@ def test_the_interval_is_the_hull() -> None:
     low, high = result.interval.T
     assert (low <= np.minimum(theta - side, tails[0]) + 1e-12).all()
     assert (high >= np.maximum(theta + side, tails[1]) - 1e-12).all()
-    assert result.blocks == 20
     assert result.draws.shape == (400, 2)
 
 

@@ -14,11 +14,7 @@ from scipy.optimize import minimize
 
 from mjfim.excitation.limits.constraints import constraint_set_of
 from mjfim.information.criteria import smooth_e_optimality
-from mjfim.optimize.cost_models import (
-    EigenvalueModel,
-    symmetric_coordinates,
-    symmetric_matrix,
-)
+from mjfim.optimize.cost_models import EigenvalueModel, symmetric_matrix
 from tests.support.numerics import Array, cart_task, relative_error
 
 LIMITS = {"control": {"force": (-9.0, 9.0)}}
@@ -39,14 +35,20 @@ def model_of(values: list[float], power: float = 12.0, share: float = 0.6) -> Ei
 
 def value(model: EigenvalueModel, d: Array) -> float:
     """Change of a model from the point about which it was made, at coordinates of B."""
-    return model._changed(d).value - model._changed(np.zeros_like(d)).value
+    return model._expanded(d)[0] - model._expanded(np.zeros_like(d))[0]
+
+
+def coordinates(full: Array) -> Array:
+    """Coordinates of a symmetric matrix: its upper triangle, with entries that occur twice."""
+    rows, columns = np.triu_indices(len(full))
+    return full[rows, columns] * np.where(rows == columns, 1.0, np.sqrt(2.0))
 
 
 def test_coordinates_keep_scalar_products() -> None:
     rng = np.random.default_rng(0)
     for r in (1, 2, 4):
         d, e = rng.normal(size=(2, r * (r + 1) // 2))
-        assert_allclose(symmetric_coordinates(symmetric_matrix(d, r)), d)
+        assert_allclose(coordinates(symmetric_matrix(d, r)), d)
         assert_array_equal(symmetric_matrix(d, r), symmetric_matrix(d, r).T)
         assert np.sum(symmetric_matrix(d, r) * symmetric_matrix(e, r)) == pytest.approx(d @ e)
 
@@ -79,7 +81,7 @@ def test_derivatives_agree_with_differences_and_the_model_is_convex(values: list
         slopes = [(value(model, d + h) - value(model, d - h)) / 2e-5 for h in 1e-5 * units]
         assert relative_error(model.gradient(d), np.array(slopes)) < 1e-6
         bends = [(model.gradient(d + h) - model.gradient(d - h)) / 2e-6 for h in 1e-6 * units]
-        assert_allclose(model._changed(d).hessian, bends, rtol=0, atol=1e-6)
+        assert_allclose(model._expanded(d)[2], bends, rtol=0, atol=1e-6)
         assert value(model, d + e) + value(model, d - e) >= 2 * value(model, d) - 1e-12
 
 
@@ -128,7 +130,7 @@ def test_slopes_agree_with_the_logarithm_of_simulated_information(
     def logarithm(ctrl: Array) -> Array:
         moved = problem.point(task.plant.simulate(task.theta, ctrl)).information
         inside = logm(information.reduced(moved)[0])
-        return symmetric_coordinates(np.real(vectors.T @ inside @ vectors))
+        return coordinates(np.real(vectors.T @ inside @ vectors))
 
     rng, open_loop = np.random.default_rng(5), np.zeros((task.samples, 1, 4))
     for _ in range(3):

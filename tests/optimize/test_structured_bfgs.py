@@ -14,14 +14,7 @@ from numpy.testing import assert_allclose
 from scipy.optimize import minimize
 
 from mjfim.optimize.cost_models import BarrierDerivatives, BarrierExpansion, Bounds
-from mjfim.optimize.lq import CurveCoordinates, LinearRecursion, TangentCurve, Weights
-from mjfim.optimize.projection_operator import (
-    Expansion,
-    Iterate,
-    Regulator,
-    optimize,
-)
-from mjfim.optimize.structured_bfgs import (
+from mjfim.optimize.directions import (
     Metric,
     Product,
     StructuredBFGS,
@@ -29,6 +22,13 @@ from mjfim.optimize.structured_bfgs import (
     basis_response,
     metric_of_curves,
     metric_of_matrix,
+)
+from mjfim.optimize.lq import CurveCoordinates, LinearRecursion, TangentCurve, Weights
+from mjfim.optimize.projection_operator import (
+    Expansion,
+    Iterate,
+    Regulator,
+    optimize,
 )
 from mjfim.parallel.budget import Budget
 from mjfim.records.design import Status

@@ -59,7 +59,7 @@ def length(order: tuple[int, SharedValue[bytes]]) -> int:
 def results(executor: Executor, value: SharedValue[bytes], count: int) -> list[int]:
     """Results of orders with a value."""
     orders = [(number, value) for number in range(count)]
-    return [outcome.result for outcome in carry_out(executor, length, orders, Budget())]
+    return [found[0] for _, found in carry_out(executor, length, orders, Budget())]
 
 
 def test_a_value_is_sent_with_the_first_tasks_alone() -> None:

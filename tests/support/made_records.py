@@ -12,7 +12,6 @@ from mjfim.arrays import Array
 from mjfim.records.design import Design, Evaluation, HistoryRow, Status
 from mjfim.records.estimate import Estimate
 from mjfim.records.robots import (
-    OddParameter,
     OddRecording,
     RecordingComparison,
 )
@@ -228,14 +227,12 @@ def make_recording_comparison(
     values = truth + std * np.random.default_rng(3).normal(size=std.shape)
     values[1, 0] += 0.5
     values[0, -1], std[0, -1] = np.nan, np.inf
-    odd = OddParameter(
-        name=parameters[0],
-        unit=units[0],
-        value=float(values[1, 0]),
-        std=0.05,
-        others=1.0,
-        others_std=0.03,
+    odd = OddRecording(
+        index=1,
+        name=names[1],
         p=2e-5,
+        parameters=parameters[:1],
+        differences=(f"its {parameters[0]} is 50 % above that of the others (p = 2e-05)",),
     )
     half = np.column_stack([truth - 0.05, truth + 0.05])
     return RecordingComparison(
@@ -252,7 +249,7 @@ def make_recording_comparison(
         p=np.geomspace(1e-5, 1.0, len(parameters)),
         prediction=half + np.array([-0.1, 0.1]),
         joint_p=1e-4,
-        odd=(OddRecording(index=1, name=names[1], p=2e-5, parameters=(odd,)),),
+        odd=(odd,),
     )
 
 

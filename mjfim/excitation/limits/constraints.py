@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import mujoco
@@ -41,7 +42,6 @@ from mjfim.model.limited_elements import (
 from mjfim.optimize.cost_models import (
     BarrierExpansion,
     Bounds,
-    StepCurvature,
     curvature_factors,
 )
 from mjfim.optimize.lq import TangentCurve, Weights
@@ -116,66 +116,6 @@ def _addresses(limits: Iterable[Limit]) -> np.ndarray:
     """Addresses of all numbers of some limits."""
     each = [limit.index + i for limit in limits for i in range(limit.count)]
     return np.array(each, dtype=np.intp)
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class CurvatureOfLimits(StepCurvature):
-    """The barrier about a trajectory, from which its curvature along steps follows.
-
-    Attributes:
-        members: The kinds of constraints.
-        values: The quantities along the trajectory, with their derivatives.
-        delta: Relaxation of the barrier, a relative margin.
-        nu: Number of controls.
-        mu: Weight of the barrier.
-    """
-
-    members: tuple[Constraint, ...]
-    values: ConstraintValues
-    delta: float
-    nu: int
-    mu: float = 1.0
-
-    def along(
-        self, step: TangentCurve, factors: Sequence[Array] | None
-    ) -> tuple[Weights, tuple[Array, ...], float]:
-        """See `StepCurvature.along`."""
-        found = []
-        growth = 1.0
-        for i, member in enumerate(self.members):
-            slacks = member.slacks(self.values)
-            old = np.ones(slacks.shape) if factors is None else factors[i]
-            changes = member.slack_changes(self.values, step)
-            new = curvature_factors(slacks, changes, old, self.delta)
-            growth = max(growth, float((new / old).max(initial=1.0)))
-            found.append(new)
-
-        _, _, weights = self.sums(found)
-        return weights.scaled(self.mu), tuple(found), growth
-
-    def sums(self, factors: Sequence[Array] | None = None) -> ExpansionSums:
-        """Gradient and Gauss-Newton Hessian of the barrier, without its weight.
-
-        Args:
-            factors: Factors of the curvature, by kind; default: 1.
-        """
-        jacobian, nu = self.values.jacobian, self.nu
-        N, nx = len(jacobian), jacobian.shape[-1] - nu
-        weights = Weights(
-            Q=np.zeros((N + 1, nx, nx)),
-            S=np.zeros((N, nu, nx)),
-            R=np.zeros((N, nu, nu)),
-            W=np.zeros((N + 1, nu)),
-        )
-        sums = np.zeros((N + 1, nx)), np.zeros((N, nu)), weights
-        for i, member in enumerate(self.members):
-            each = None if factors is None else factors[i]
-            member.add_expansion(self.values, self.delta, sums, each)
-        return sums
-
-    def scaled(self, mu: float) -> CurvatureOfLimits:
-        """See `StepCurvature.scaled`."""
-        return replace(self, mu=mu * self.mu)
 
 
 # Distance beyond the stated clearance up to which distances are measured, relative to the length of
@@ -355,13 +295,10 @@ class ConstraintSet:
         Returns:
             The expansion.
         """
-        nu = values.trajectory.ctrl.shape[1]
         values = replace(values, observation_jacobian=observation_jacobian)
+        a, b, weights = self._sums(values, delta)
 
-        curvature = CurvatureOfLimits(members=self.members, values=values, delta=delta, nu=nu)
-        a, b, weights = curvature.sums()
-
-        step_scale = np.full(nu, np.inf)
+        step_scale = np.full(b.shape[1], np.inf)
         if self.rate is not None:
             step_scale = self.rate.bounds.scale * self.rate.dt
 
@@ -372,8 +309,52 @@ class ConstraintSet:
             observations=observation_jacobian / self.substeps.column_scale[:, None],
             control_scale=self.control.bounds.scale,
             control_step_scale=step_scale,
-            curvature=curvature,
+            curvature=partial(self._curvature_along, values, delta),
         )
+
+    def _curvature_along(
+        self,
+        values: ConstraintValues,
+        delta: float,
+        step: TangentCurve,
+        factors: Sequence[Array] | None,
+    ) -> tuple[Weights, tuple[Array, ...], float]:
+        """See `StepCurvature`."""
+        found = []
+        growth = 1.0
+        for i, member in enumerate(self.members):
+            slacks = member.slacks(values)
+            old = np.ones(slacks.shape) if factors is None else factors[i]
+            new = curvature_factors(slacks, member.slack_changes(values, step), old, delta)
+            growth = max(growth, float((new / old).max(initial=1.0)))
+            found.append(new)
+
+        _, _, weights = self._sums(values, delta, found)
+        return weights, tuple(found), growth
+
+    def _sums(
+        self, values: ConstraintValues, delta: float, factors: Sequence[Array] | None = None
+    ) -> ExpansionSums:
+        """Gradient and Gauss-Newton Hessian of the barrier.
+
+        Args:
+            values: The quantities along the trajectory, with their derivatives.
+            delta: Relaxation of the barrier, a relative margin.
+            factors: Factors of the curvature, by kind; default: 1.
+        """
+        N, nu = values.trajectory.ctrl.shape
+        nx = values.jacobian.shape[-1] - nu
+        weights = Weights(
+            Q=np.zeros((N + 1, nx, nx)),
+            S=np.zeros((N, nu, nx)),
+            R=np.zeros((N, nu, nu)),
+            W=np.zeros((N + 1, nu)),
+        )
+        sums = np.zeros((N + 1, nx)), np.zeros((N, nu)), weights
+        for i, member in enumerate(self.members):
+            each = None if factors is None else factors[i]
+            member.add_expansion(values, delta, sums, each)
+        return sums
 
 
 def constraint_set_of(task: DesignTask, every: bool = False) -> ConstraintSet:

@@ -28,7 +28,6 @@ from mjfim.excitation.limits.constraints import (
     quantities_at,
 )
 from mjfim.excitation.limits.limits import Limit
-from mjfim.excitation.search.levels import bandwidth_basis
 from mjfim.excitation.task import DesignTask
 from mjfim.excitation.task_parts import named_file
 from mjfim.model.units import LENGTH
@@ -316,7 +315,7 @@ def require_feasible_start(task: DesignTask) -> None:
     """
     with named_file(task.experiment):
         constraints = constraint_set_of(task, every=True)
-        bandwidth_basis(task, task.stated_times)
+        task.bandwidth_basis(task.stated_times)
         if not task.experiment.limits.enforce:
             return
 

@@ -17,7 +17,7 @@ from mjfim.errors import SimulationDivergedError
 from mjfim.excitation.limits.verification import verify
 from mjfim.excitation.objective import DesignPoint
 from mjfim.excitation.search.descent import Barrier, FreeMemory, Ground, Step
-from mjfim.excitation.search.inside import InsideSearch, LimitedCost, with_corrected_end
+from mjfim.excitation.search.inside import InsideSearch, with_corrected_end
 from mjfim.excitation.search.levels import DescentLevel
 from mjfim.excitation.task import DesignTask
 from mjfim.excitation.task_parts import Known
@@ -186,10 +186,9 @@ class Grounds:
     def __init__(
         self, task: DesignTask, combinations: Array | None, first: DesignPoint | None = None
     ) -> None:
-        self.stated = DescentLevel(task, combinations)
+        self.stated = DescentLevel(task, combinations, first=first)
         self._levels = {task.system.variant: self.stated}
         self._grounds: dict[tuple[ModelVariant, int], Ground] = {}
-        self.cost = LimitedCost(level=self.stated, first=first)
         self._steps_before = self._counted_steps
 
     def keep(self, level: DescentLevel) -> None:
@@ -502,37 +501,37 @@ class Climb:
         Args:
             variant: Plant of the rung.
         """
-        found, begun, cost = self.candidate, self._begin, self._grounds.cost
+        found, begun, stated = self.candidate, self._begin, self._grounds.stated
         last, level_cost, is_far_lower = self._last()
-        control = without_jumps(cost, last.over_horizon, variant.sample_factor)
+        control = without_jumps(stated, last.over_horizon, variant.sample_factor)
         curves = found.curves if self._move.keeps_curves else None
         following = replace(
             found, control=control, curves=curves, repeats=1, first_weight=None, is_judged=True
         )
-        values = cost.level.values(control)
-        point = cost.point_along(values)
+        values = stated.values(control)
+        point = stated.point_along(values)
         if point is None:
             return replace(begun, history=found.history, steps=found.steps, is_judged=True)
 
-        if cost.keeps_along(values):
+        if stated.keeps_along(values):
             following = following.improved(control, point)
             return replace(following, rank=point.cost)
 
-        centre = self._grounds.stated.task.centre
-        search = InsideSearch(cost, 0)
+        centre = stated.task.centre
+        search = InsideSearch(stated, 0)
         for each in (
-            with_corrected_end(cost, control, self._budget),
+            with_corrected_end(stated, control, self._budget),
             search.largest(centre, control - centre, self._budget),
         ):
             if each is not None:
                 following = following.improved(each.control, each.point)
-        if last is not found and (inside := cost.inside(found.over_horizon)) is not None:
+        if last is not found and (inside := stated.inside(found.over_horizon)) is not None:
             following = following.improved(found.over_horizon, inside)
         if is_far_lower and following.best is not None and not self._move.is_last:
             # Where the rung ends outside the limits, the next one begins inside.
             return replace(following, control=following.best, rank=following.cost)
         error = point.cost - level_cost
-        if error <= LARGEST_ERROR * cost.level.problem.size(point):
+        if error <= LARGEST_ERROR * stated.problem.size(point):
             return replace(following, rank=min(level_cost, following.cost))
         if begun.cost < point.cost:
             blunt = begun.first_weight
@@ -571,17 +570,17 @@ def tightened(before: Mapping[str, float], margins: Mapping[str, float]) -> dict
     }
 
 
-def without_jumps(cost: LimitedCost, control: Array, factor: int) -> Array:
+def without_jumps(level: DescentLevel, control: Array, factor: int) -> Array:
     """A control of longer samples without steps, where rates of controls are limited.
 
     Args:
-        cost: The cost within the limits.
+        level: The stated level.
         control: (N, nu) control [u-unit].
         factor: Factor by which its samples are longer.
     """
     values = control[::factor]
     is_stepped = factor > 1 and np.array_equal(control, np.repeat(values, factor, axis=0))
-    if cost.level.constraints.rate is None or not is_stepped:
+    if level.constraints.rate is None or not is_stepped:
         return control
 
     # The values of the longer samples hold at their middles.

@@ -20,12 +20,11 @@ from mjfim.excitation.limits.constraints import FORCE_KINDS
 from mjfim.excitation.objective import DIVERGED, DesignPoint, DesignProblem
 from mjfim.excitation.search.inside import largest_share
 from mjfim.excitation.search.interior_problem import InteriorPoint, InteriorProblem, values_of
-from mjfim.excitation.search.levels import DescentLevel, bandwidth_basis, regulator_for
+from mjfim.excitation.search.levels import DescentLevel, regulator_for
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.initial import independent_curves
-from mjfim.optimize.directions import LBFGS, MetricDescent
+from mjfim.optimize.directions import LBFGS, MetricDescent, StructuredBFGS
 from mjfim.optimize.projection_operator import Direction, Iterate, Regulator, optimize
-from mjfim.optimize.structured_bfgs import StructuredBFGS
 from mjfim.parallel.budget import Budget
 from mjfim.records.design import Status
 
@@ -153,7 +152,7 @@ class Ground:
             task = task.with_horizon(task.horizon / repeats)
             level = replace(level, task=task)
         if curves is None:
-            curves = bandwidth_basis(task, task.stated_times)
+            curves = task.bandwidth_basis(task.stated_times)
         return cls(level=level, curves=curves, repeats=repeats)
 
     @property

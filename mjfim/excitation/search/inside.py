@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -20,9 +19,8 @@ from mjfim.arrays import Array, record
 from mjfim.errors import SimulationDivergedError
 from mjfim.excitation.evaluation import UNSTABLE_GROWTH, growth_along
 from mjfim.excitation.limits.constraint_kinds import ConstraintValues, EndStateConstraint
-from mjfim.excitation.limits.verification import verify
 from mjfim.excitation.objective import DesignPoint
-from mjfim.excitation.search.levels import DescentLevel, bandwidth_basis, moved_alike
+from mjfim.excitation.search.levels import DescentLevel
 from mjfim.excitation.task import FADE_SHARE
 from mjfim.parallel.budget import Budget
 from mjfim.records.design import ScaledStart
@@ -62,47 +60,6 @@ SMALLER_TRIALS = 3
 
 # Decrease of the cost that counts as progress (relative).
 LEAST_PROGRESS = 0.01
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class LimitedCost:
-    """Cost of controls that keep all limits on the stated level.
-
-    Attributes:
-        level: The level, on the plant without the clamps that limits make unreachable.
-        first: The initial control, evaluated on the unmodified plant; None where it is not known.
-    """
-
-    level: DescentLevel
-    first: DesignPoint | None = None
-
-    def nearly_keeps(self, control: Array) -> bool:
-        """Check the limits on the plant of the search only, which is much quicker."""
-        values = self.level.values(control)
-        return values is not None and self.level.constraints.is_feasible(values)
-
-    def keeps(self, control: Array) -> bool:
-        """Check the limits on the unmodified model as well."""
-        return self.keeps_along(self.level.values(control))
-
-    def keeps_along(self, values: ConstraintValues | None) -> bool:
-        """Check the limits along a motion, also on the unmodified model."""
-        if values is None or not self.level.constraints.is_feasible(values):
-            return False
-        return verify(self.level.task, values.trajectory).is_feasible
-
-    def point_along(self, values: ConstraintValues | None) -> DesignPoint | None:
-        """Evaluate a motion, inside limits or not; None where it diverges."""
-        if values is None:
-            return None
-        known = None if self.first is None else moved_alike(self.first, values.trajectory)
-        point = self.level.problem.point(values.trajectory) if known is None else known
-        return None if point.trajectory is None else point
-
-    def inside(self, control: Array) -> DesignPoint | None:
-        """Evaluate a control: (N, nu); None where it violates a limit."""
-        values = self.level.values(control)
-        return self.point_along(values) if self.keeps_along(values) else None
 
 
 @record
@@ -180,12 +137,12 @@ class InsideSearch:
     """Search for controls that keep all limits, by scaling and by random changes.
 
     Args:
-        cost: The cost within the limits.
+        level: The level, on the plant without the clamps that limits make unreachable.
         seed: Seed of the random changes.
     """
 
-    def __init__(self, cost: LimitedCost, seed: int) -> None:
-        self.cost = cost
+    def __init__(self, level: DescentLevel, seed: int) -> None:
+        self.level = level
         self._rng = np.random.default_rng(seed)
         # Bandwidths of random controls that have not been tried yet. None stands for the best
         # control so far, as large as the limits allow.
@@ -199,7 +156,7 @@ class InsideSearch:
         """
         found = [
             self.largest(centre, self.fitted(control - centre), budget)
-            for centre in self.cost.level.task.centres
+            for centre in self.level.task.centres
         ]
         return min((each for each in found if each), key=lambda each: each.cost, default=None)
 
@@ -209,7 +166,7 @@ class InsideSearch:
         The limits on the unmodified model are checked at the end, and at every share only where
         that fails. A request to stop ends the search for a larger share.
         """
-        for keeps in (self.cost.nearly_keeps, self.cost.keeps):
+        for keeps in (self.level.nearly_keeps, self.level.keeps):
 
             def passes(share: float, keeps: Callable[[Array], bool] = keeps) -> bool:
                 """Whether a share of the deviation passes the test."""
@@ -263,15 +220,15 @@ class InsideSearch:
 
     def fitted(self, deviation: Array) -> Array:
         """The nearest deviation, (N, nu), that has the bandwidth which the experiment allows."""
-        task = self.cost.level.task
-        basis = bandwidth_basis(task, task.stated_times)
+        task = self.level.task
+        basis = task.bandwidth_basis(task.stated_times)
         if basis is None:
             return deviation
         return np.asarray(basis @ np.linalg.lstsq(basis, deviation)[0])
 
     def _evaluated(self, about: Array, deviation: Array, share: float) -> InsideControl | None:
         """A control with its cost; None where it violates a limit or tells nothing."""
-        point = self.cost.inside(about + deviation)
+        point = self.level.inside(about + deviation)
         if point is None or not np.isfinite(point.cost):
             return None
         return InsideControl(about=about, deviation=deviation, point=point, share=share)
@@ -302,7 +259,7 @@ class InsideSearch:
                 larger[i] *= factor
                 if budget.exhausted is not None:
                     break
-                if self.cost.nearly_keeps(inside.about + larger * inside.deviation):
+                if self.level.nearly_keeps(inside.about + larger * inside.deviation):
                     factors = larger
         if (factors == 1.0).all():
             return inside
@@ -326,7 +283,7 @@ class InsideSearch:
 
     def _noise(self, bandwidth: float) -> Array:
         """(N, nu) random curves that fade in, and fade out where the design ends at rest."""
-        task = self.cost.level.task
+        task = self.level.task
         N, nu = task.control.shape
         lines = max(round(bandwidth * (N // 2)), 1)
         spectrum = np.zeros((N // 2 + 1, nu), dtype=np.complex128)
@@ -356,11 +313,11 @@ class InsideSearch:
     @cached_property
     def _largest_growth(self) -> float:
         """Largest amplification of a small disturbance that a control may have."""
-        return max(UNSTABLE_GROWTH, self._growth(self.cost.level.task.control))
+        return max(UNSTABLE_GROWTH, self._growth(self.level.task.control))
 
     def _growth(self, control: Array) -> float:
         """Amplification of a small disturbance along a control: (N, nu)."""
-        task = self.cost.level.task
+        task = self.level.task
         try:
             return growth_along(task, task.plant.simulate(task.theta, control))
         except SimulationDivergedError:
@@ -369,7 +326,7 @@ class InsideSearch:
     @property
     def _widths(self) -> Array:
         """(nu,) half of the ranges of the controls [u-unit]."""
-        return self.cost.level.constraints.control.bounds.scale
+        return self.level.constraints.control.bounds.scale
 
 
 # Singular values of the reachable ends, relative to the largest one, below which they count as
@@ -381,13 +338,13 @@ CORRECTION_SHARES = (1.0, 0.98, 0.94, 0.85, 0.72, 0.55, 0.35)
 CORRECTIONS = 2
 
 
-def _end_correction(cost: LimitedCost, values: ConstraintValues) -> Array | None:
+def _end_correction(level: DescentLevel, values: ConstraintValues) -> Array | None:
     """The smallest change of a control that moves the last state of a motion, to first order.
 
     It keeps the bandwidth that the experiment states. Without one it is free at each sample.
 
     Args:
-        cost: Cost of controls that keep all limits, whose plant is linearised.
+        level: The level whose plant is linearised.
         values: Limited quantities along the motion.
 
     Returns:
@@ -395,7 +352,7 @@ def _end_correction(cost: LimitedCost, values: ConstraintValues) -> Array | None
         that has a tolerance [x-unit]. None with a free end, and where the motion diverges or is so
         unstable that its derivatives overflow.
     """
-    constraints, task = cost.level.constraints, cost.level.task
+    constraints, task = level.constraints, level.task
     if constraints.end is None:
         return None
     try:
@@ -416,7 +373,7 @@ def _end_correction(cost: LimitedCost, values: ConstraintValues) -> Array | None
             reach = reach @ A[k]
 
         # A control of limited bandwidth is a sum of splines, of which only the shares are free.
-        curves = bandwidth_basis(task, task.stated_times)
+        curves = task.bandwidth_basis(task.stated_times)
         by_share = by_control if curves is None else np.tensordot(curves.T, by_control, axes=1)
 
         # States have several units, so that each row is divided by its tolerance.
@@ -437,37 +394,37 @@ def _has_tolerance(end: EndStateConstraint) -> NDArray[np.bool_]:
     return np.isfinite(end.bounds.upper)
 
 
-def with_corrected_end(cost: LimitedCost, control: Array, budget: Budget) -> InsideControl | None:
+def with_corrected_end(level: DescentLevel, control: Array, budget: Budget) -> InsideControl | None:
     """Find a large share of a control that keeps all limits, when its end is corrected.
 
     Args:
-        cost: The cost within the limits.
+        level: The level, on the plant without the clamps that limits make unreachable.
         control: (N, nu) control, whose motion misses its target by little [u-unit].
         budget: A request to stop ends the search.
 
     Returns:
         The control; None where the motion does not miss its target, or no share helps.
     """
-    centre = cost.level.task.centre
-    end, change = cost.level.constraints.end, None
+    centre = level.task.centre
+    end, change = level.constraints.end, None
     for share in CORRECTION_SHARES:
         candidate = np.asarray(centre + share * (control - centre))
         for corrections_left in reversed(range(1 + CORRECTIONS)):
-            values = cost.level.values(candidate)
+            values = level.values(candidate)
             if values is None or budget.stop.requested:
                 break
-            if cost.level.constraints.is_feasible(values):
-                point = cost.point_along(values) if cost.keeps_along(values) else None
+            if level.constraints.is_feasible(values):
+                point = level.point_along(values) if level.keeps_along(values) else None
                 if point is not None and np.isfinite(point.cost):
                     deviation = candidate - centre
                     return InsideControl(about=centre, deviation=deviation, point=point)
                 break
-            margins = cost.level.constraints.margins(values)
+            margins = level.constraints.margins(values)
             misses = any(each < 0.0 for kind, each in margins.items() if kind.startswith("end_"))
             if not (misses and corrections_left):
                 break
             # The change of the control hardly depends on its size, so that it is computed once.
-            change = _end_correction(cost, values) if change is None else change
+            change = _end_correction(level, values) if change is None else change
             if end is None or change is None:
                 return None
             difference = end.space.minus(values.trajectory.state[-1], end.target)

@@ -12,62 +12,12 @@ from mjfim.arrays import Array
 from mjfim.errors import ExperimentError, SimulationDivergedError
 from mjfim.excitation.limits.constraint_kinds import ConstraintValues
 from mjfim.excitation.limits.constraints import ConstraintSet, constraint_set_of
+from mjfim.excitation.limits.verification import verify
 from mjfim.excitation.objective import DesignPoint, DesignProblem
 from mjfim.excitation.task import DesignTask
-from mjfim.experiment.initial import spline_basis
 from mjfim.optimize.projection_operator import Regulator
 from mjfim.plant.plant import LumpedParameters
 from mjfim.records.trajectory import Trajectory
-
-
-def bandwidth_basis(task: DesignTask, t: Array) -> Array | None:
-    """Make the splines of the bandwidth that the experiment states.
-
-    Args:
-        task: The task.
-        t: (N,) times [s].
-
-    Returns:
-        (N, M) splines whose sums are the allowed deviations of the control from its centre; None
-        where the bandwidth is not limited.
-
-    Raises:
-        ExperimentError: The bandwidth is above half of the sample rate.
-    """
-    bandwidth, rate = task.experiment.limits.bandwidth, task.experiment.rate
-    if bandwidth is None:
-        return None
-
-    highest = 0.5 * rate
-    if bandwidth > highest:
-        raise ExperimentError(
-            f"limits.bandwidth: {bandwidth:g} Hz; a control at {rate:g} Hz has {highest:g} Hz at "
-            "most"
-        )
-    return boundary_splines(task, t, bandwidth)
-
-
-def boundary_splines(task: DesignTask, t: Array, bandwidth: float) -> Array:
-    """Make splines that begin and end as the experiment's `[boundary]` states.
-
-    Args:
-        task: The task.
-        t: (N,) times [s].
-        bandwidth: Their bandwidth [Hz].
-
-    Returns:
-        (N, M) splines.
-    """
-    boundary = task.experiment.boundary
-    starts_at_rest = boundary.start == "rest"
-    periodic = boundary.end == "periodic"
-
-    # A periodic control that starts at rest ends at rest too.
-    ends_at_rest = boundary.end == "rest" or (periodic and starts_at_rest)
-    return spline_basis(
-        t, task.horizon, bandwidth, starts_at_rest, ends_at_rest, periodic and not starts_at_rest
-    )
-
 
 # Smallest number of samples of a coarse level.
 MIN_COARSE_SAMPLES = 50
@@ -95,11 +45,13 @@ class DescentLevel:
         basis: (t, s) identifiable combinations of the parameters, or None where all are
             identifiable.
         power: Power of the smooth E-criterion; infinite for 1/lambda_min itself.
+        first: The initial control, evaluated on the unmodified plant; None where it is not known.
     """
 
     task: DesignTask
     basis: Array | None
     power: float = np.inf
+    first: DesignPoint | None = None
 
     @cached_property
     def problem(self) -> DesignProblem:
@@ -122,6 +74,34 @@ class DescentLevel:
     def values(self, control: Array) -> ConstraintValues | None:
         """Limited quantities along a control: (N, nu); None where the simulation diverges."""
         return self.constraints.along(self.task.plant, self.task.theta, control)
+
+    def nearly_keeps(self, control: Array) -> bool:
+        """Check the limits on the plant of this level only, which is much quicker."""
+        values = self.values(control)
+        return values is not None and self.constraints.is_feasible(values)
+
+    def keeps(self, control: Array) -> bool:
+        """Check the limits on the unmodified model as well."""
+        return self.keeps_along(self.values(control))
+
+    def keeps_along(self, values: ConstraintValues | None) -> bool:
+        """Check the limits along a motion, also on the unmodified model."""
+        if values is None or not self.constraints.is_feasible(values):
+            return False
+        return verify(self.task, values.trajectory).is_feasible
+
+    def point_along(self, values: ConstraintValues | None) -> DesignPoint | None:
+        """Evaluate a motion, inside limits or not; None where it diverges."""
+        if values is None:
+            return None
+        known = None if self.first is None else moved_alike(self.first, values.trajectory)
+        point = self.problem.point(values.trajectory) if known is None else known
+        return None if point.trajectory is None else point
+
+    def inside(self, control: Array) -> DesignPoint | None:
+        """Evaluate a control: (N, nu); None where it violates a limit."""
+        values = self.values(control)
+        return self.point_along(values) if self.keeps_along(values) else None
 
     @property
     def engine_steps(self) -> int:

@@ -164,7 +164,7 @@ class Search:
     @cached_property
     def inside(self) -> InsideSearch:
         """Search without derivatives, for controls that keep the limits."""
-        return InsideSearch(self.grounds.cost, self.stage.task.experiment.descent.seed)
+        return InsideSearch(self.grounds.stated, self.stage.task.experiment.descent.seed)
 
     @cached_property
     def scaled(self) -> InsideControl | None:
@@ -182,7 +182,7 @@ class Search:
         """Check whether the motion of a point keeps the hard limits."""
         if not self.grounds.is_limited:
             return True
-        return point.trajectory is not None and self.grounds.cost.keeps(point.trajectory.ctrl)
+        return point.trajectory is not None and self.grounds.stated.keeps(point.trajectory.ctrl)
 
     @property
     def steps(self) -> int:
@@ -258,11 +258,12 @@ class Search:
 
     def _enlarged(self, first: Candidate) -> Candidate:
         """The first candidate, enlarged while it keeps all limits and its cost falls."""
-        cost, centre = self.grounds.cost, self.grounds.stated.task.centre
+        stated = self.grounds.stated
+        centre = stated.task.centre
         control, least = first.over_horizon, self.first.cost
         while self.budget.used < OUTSIDE_SHARE and self.budget.exhausted is None:
             larger = np.asarray(centre + ENLARGING * (control - centre))
-            point = cost.inside(larger)
+            point = stated.inside(larger)
             if point is None or not point.cost < least:
                 break
             control, least = larger, point.cost
@@ -439,11 +440,9 @@ class Search:
         for found in self.inside.improvements(inside, budget, PATIENCE):
             inside = found
             candidate = candidate.improved(found.control, found.point)
-            values = self.grounds.cost.level.values(found.control)
+            values = self.grounds.stated.values(found.control)
             margins = (
-                {}
-                if values is None
-                else self.grounds.cost.level.constraints.relative_margins(values)
+                {} if values is None else self.grounds.stated.constraints.relative_margins(values)
             )
             row = row_of(
                 found.point,
@@ -660,13 +659,13 @@ class Search:
                 for each in waiting
             ]
             before, waiting = waiting, []
-            for outcome in carry_out(self.executor, move_in_worker, moves, self.budget):
-                begun = before[outcome.index]
-                if outcome.is_lost:
+            for index, ended in carry_out(self.executor, move_in_worker, moves, self.budget):
+                begun = before[index]
+                if not ended:
                     # What was lost with its worker is done here.
-                    found = yield from Climb(self.grounds, moves[outcome.index]).run()
+                    found = yield from Climb(self.grounds, moves[index]).run()
                 else:
-                    found = outcome.result
+                    found = ended[0]
                     self.remote_steps += found.steps - begun.steps
                     for row in found.history[len(begun.history) :]:
                         if not self.budget.stop.requested:
@@ -674,13 +673,13 @@ class Search:
                 results[found.name] = found
                 has_moved = len(found.history) > len(begun.history)
                 is_over = found.is_judged or found.has_left or found.is_held_up or found.status
-                if moves[outcome.index].may_continue and has_moved and not is_over:
+                if moves[index].may_continue and has_moved and not is_over:
                     waiting.append(found)
             if self.budget.exhausted is not None:
                 break
 
-        ended = [results[each.name] for each in candidates if results[each.name] is not each]
-        return [self._ended(each, rungs[-1], is_last) for each in ended]
+        moved = [results[each.name] for each in candidates if results[each.name] is not each]
+        return [self._ended(each, rungs[-1], is_last) for each in moved]
 
     def _ended(self, found: Candidate, rung: Rung, is_last: bool) -> Candidate:
         """A candidate after its last move, judged on the stated plant."""

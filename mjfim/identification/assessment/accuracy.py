@@ -23,6 +23,7 @@ from mjfim.arrays import (
 from mjfim.identification.assessment.honest_covariance import between_covariance
 from mjfim.identification.assessment.residual_tests import FitQuality
 from mjfim.identification.assessment.robust_covariance import (
+    Uncertainty,
     block_length,
     inverse_root,
     robust_uncertainty,
@@ -35,7 +36,7 @@ from mjfim.information.null_space import NullSpace, parameter_groups
 from mjfim.model.parameters import ParameterSet
 from mjfim.optimize.levenberg_marquardt import Solution, UnknownValues
 from mjfim.records.check import ParameterGroup
-from mjfim.records.estimate import HorizonStudy, PriorDirections, Restart, Uncertainty
+from mjfim.records.estimate import HorizonStudy, PriorDirections, Restart
 from mjfim.records.estimate_parts import InformationInTime, InverseDynamicsFit
 
 # A combination is determined by the recordings where these leave at most this share of the standard

@@ -25,12 +25,13 @@ import numpy as np
 
 from mjfim.arrays import NORMAL_95, Array
 from mjfim.identification.assessment.robust_covariance import (
+    Uncertainty,
     covariance_root,
     covering_covariance,
     t_quantile,
 )
 from mjfim.model.parameters import ParameterSet
-from mjfim.records.estimate import Estimate, HorizonStudy, Uncertainty
+from mjfim.records.estimate import Estimate, HorizonStudy
 
 
 def jackknife_deviations(without_parts: Array) -> Array:

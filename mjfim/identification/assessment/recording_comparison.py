@@ -34,7 +34,13 @@ from mjfim.identification.assessment.robust_covariance import (
     weighted,
 )
 from mjfim.information.criteria import standard_deviations
-from mjfim.records.robots import OddParameter, OddRecording, RecordingComparison
+from mjfim.records.robots import (
+    OddRecording,
+    RecordingComparison,
+    difference_text,
+    p_text,
+    value_text,
+)
 
 # Newton steps for tau², of which the weighted squares are a decreasing function.
 MAX_NEWTON_STEPS = 60
@@ -43,66 +49,64 @@ MAX_NEWTON_STEPS = 60
 TAU_TOLERANCE = 1e-10
 
 
-@record
-class RandomEffects:
-    """Means of q quantities over recordings.
-
-    Attributes:
-        count: (q,) number of recordings that estimate each quantity.
-        mean: (q,) means; NaN where no recording estimates the quantity.
-        variance: (q,) variances of the means.
-        tau2: (q,) variances between recordings.
-        share: (q,) I²: share of the scatter that is between recordings, 0 to 1.
-        p: (q,) p-values of the hypothesis that there is no scatter between recordings; 1 where
-            fewer than two recordings estimate the quantity.
-        prediction: (q, 2) 95 % intervals of what another recording suggests; infinite with fewer
-            than three.
-    """
-
-    count: np.ndarray
-    mean: Array
-    variance: Array
-    tau2: Array
-    share: Array
-    p: Array
-    prediction: Array
-
-
-def random_effects(values: Array, variances: Array, freedom: float) -> RandomEffects:
+def random_effects(values: Array, variances: Array) -> tuple[Array, Array, Array]:
     """Average estimates of several recordings.
 
     Args:
         values: (K, q) estimates; NaN where a recording gives none.
         variances: (K, q) their variances.
+
+    Returns:
+        (q,) means, NaN where no recording estimates the quantity, (q,) their variances, and (q,)
+        variances between recordings.
+    """
+    tau2 = between_variance(values, variances)
+    weights, mean, _ = weighted(values, variances, tau2)
+    total = weights.sum(axis=0)
+    is_known = total > 0.0
+    variance = np.where(is_known, 1.0 / np.where(is_known, total, 1.0), np.inf)
+    return np.where(is_known, mean, np.nan), variance, tau2
+
+
+def heterogeneity(values: Array, variances: Array, freedom: float) -> tuple[Array, Array]:
+    """Test whether estimates scatter between recordings.
+
+    Args:
+        values: (K, q) estimates; NaN where a recording gives none.
+        variances: (K, q) their variances.
         freedom: Degrees of freedom of the variances.
+
+    Returns:
+        (q,) I²: share of the scatter that is between recordings, 0 to 1; and (q,) p-values of the
+        hypothesis that there is none, 1 where fewer than two recordings estimate the quantity.
     """
     weights, _, deviation = weighted(values, variances)
     squares = np.sum(weights * deviation**2, axis=0)
-    count = np.sum(weights > 0.0, axis=0)
-    others = np.maximum(count - 1, 1)
+    others = np.maximum(np.sum(weights > 0.0, axis=0) - 1, 1)
+    # Cochran's Q, by the F distribution because the variances are estimated as well.
+    p = scipy.special.fdtrc(others, freedom, squares / others)
+    return 1.0 - others / np.maximum(squares, others), p
 
-    tau2 = between_variance(values, variances)
+
+def prediction(values: Array, variances: Array, tau2: Array) -> Array:
+    """(q, 2) 95 % intervals of what another recording suggests; infinite with fewer than three.
+
+    Args:
+        values: (K, q) estimates; NaN where a recording gives none.
+        variances: (K, q) their variances.
+        tau2: (q,) variances between recordings.
+    """
     weights, mean, deviation = weighted(values, variances, tau2)
     scatter, total = np.sum(weights * deviation**2, axis=0), weights.sum(axis=0)
-    mean = np.where(count > 0, mean, np.nan)
-    variance = np.where(count > 0, 1.0 / np.where(count > 0, total, 1.0), np.inf)
-
-    # Another recording, with the mean weight of the present ones. Its interval is not known with
-    # fewer than three of them.
+    count = np.sum(weights > 0.0, axis=0)
     enough = count > 2
+    others = np.where(enough, count - 1, 1)
+
+    # Another recording has the mean weight of the present ones.
     new_variance = (1.0 + count) / np.where(enough, total, 1.0)
     reach = t_quantile(others) * np.sqrt(scatter / others * new_variance)
     reach = np.where(enough, reach, np.inf)
-    # Cochran's Q, by the F distribution because the variances are estimated as well.
-    return RandomEffects(
-        count=count,
-        mean=mean,
-        variance=variance,
-        tau2=tau2,
-        share=1.0 - others / np.maximum(squares, others),
-        p=scipy.special.fdtrc(others, freedom, squares / others),
-        prediction=np.column_stack([mean - reach, mean + reach]),
-    )
+    return np.column_stack([mean - reach, mean + reach])
 
 
 def between_variance(values: Array, variances: Array) -> Array:
@@ -359,44 +363,48 @@ def odd_recordings(
         if p > ODD_LEVEL:
             break
         remaining.remove(worst)
-        named = [
-            OddParameter(
-                name=parameters[j],
-                unit=units[j],
-                value=float(views.values[worst, j]),
-                std=float(views.std[worst, j]),
-                others=float(others.mean[j]),
-                others_std=float(np.sqrt(others.variance[j])),
-                p=float(each[j]),
-                is_single=bool(is_single[j]),
+        differences = {}
+        for j in np.argsort(each, kind="stable")[:MAX_NAMED].tolist():
+            if each[j] > NAMED_LEVEL:
+                break
+            own, (mean, std) = views.values[worst, j], others[:, j]
+            difference = difference_text(own, mean, std, units[j], is_single=bool(is_single[j]))
+            own_text = value_text(own, views.std[worst, j])
+            numbers = f"{own_text} against {value_text(mean, std)} {units[j]}".rstrip()
+            differences[parameters[j]] = (
+                f"its {parameters[j]} is {difference} that of the others "
+                f"({numbers}, {p_text(each[j])})"
             )
-            for j in np.argsort(each, kind="stable")[:MAX_NAMED]
-            if each[j] <= NAMED_LEVEL
-        ]
         found.append(
-            OddRecording(index=worst, name=recordings[worst], p=p, parameters=tuple(named))
+            OddRecording(
+                index=worst,
+                name=recordings[worst],
+                p=p,
+                parameters=tuple(differences),
+                differences=tuple(differences.values()),
+            )
         )
     return found
 
 
 def _left_out(
     views: RecordingViews, k: int, remaining: Sequence[int]
-) -> tuple[float, Array, RandomEffects]:
+) -> tuple[float, Array, Array]:
     """Test whether recording k differs from the other remaining ones.
 
     Returns:
         The p-value, corrected for the number of tests of all recordings, (s,) p-values of single
-        parameters, corrected likewise, and the means of the others.
+        parameters, corrected likewise, and (2, s) means of the others with their standard
+        deviations.
     """
     others = [i for i in remaining if i != k]
     values, variances = views.values[others], views.std[others] ** 2
-    effects = random_effects(values, variances, views.freedom)
-    tau2 = effects.tau2
+    mean, variance_of_mean, tau2 = random_effects(values, variances)
 
     # Single parameters, by Student's distribution. The scatter between the others is known from
     # few of them.
-    gap = views.values[k] - effects.mean
-    variance = views.std[k] ** 2 + effects.variance + tau2
+    gap = views.values[k] - mean
+    variance = views.std[k] ** 2 + variance_of_mean + tau2
     is_known = np.isfinite(gap) & np.isfinite(variance)
     variance = np.where(is_known, variance, 1.0)
     share = np.where(is_known, tau2 / variance, 0.0)
@@ -415,7 +423,7 @@ def _left_out(
     tests = 2.0 * len(remaining)
     each = np.minimum(tests * max(int(is_known.sum()), 1) * each, 1.0)
     p = min(tests * joint, float(each.min(initial=1.0)), 1.0)
-    return p, each, effects
+    return p, each, np.array([mean, np.sqrt(variance_of_mean)])
 
 
 def compare_recordings(fit: FitResult) -> RecordingComparison | None:
@@ -495,14 +503,15 @@ def compare_evidence(
     count, values, std = len(theta), views.values, views.std
     if stated is not None:
         values, std = np.column_stack([values, stated[0]]), np.column_stack([std, stated[1]])
-    effects = random_effects(values, std**2, views.freedom)
-    mean, deviation = effects.mean, np.sqrt(effects.variance)
-    total = with_scatter(views.parts, views.scatter(effects.tau2[:count])).sum(axis=0)
+    mean, variance, tau2 = random_effects(values, std**2)
+    deviation = np.sqrt(variance)
+    total = with_scatter(views.parts, views.scatter(tau2[:count])).sum(axis=0)
     mean[:count], deviation[:count] = _estimate(views.theta, views.directions, total)
-    share = effects.tau2 / np.where(deviation > 0.0, deviation**2 * evidence.count, 1.0)
+    share = tau2 / np.where(deviation > 0.0, deviation**2 * evidence.count, 1.0)
     reach = t_quantile(satterthwaite(share, views.freedom, evidence.count - 1)) * deviation
     squares, dof = difference(views.parts)
     is_stated = np.arange(len(parameters)) >= count
+    between, p = heterogeneity(values, std**2, views.freedom)
     return RecordingComparison(
         recordings=tuple(recordings),
         parameters=tuple(parameters),
@@ -512,10 +521,10 @@ def compare_evidence(
         std=std,
         mean=mean,
         interval=np.column_stack([mean - reach, mean + reach]),
-        tau=np.sqrt(effects.tau2),
-        share=effects.share,
-        p=np.where(is_stated, 1.0, np.minimum(count * effects.p, 1.0)),
-        prediction=effects.prediction,
+        tau=np.sqrt(tau2),
+        share=between,
+        p=np.where(is_stated, 1.0, np.minimum(count * p, 1.0)),
+        prediction=prediction(values, std**2, tau2),
         joint_p=f_tail(squares, dof, views.freedom),
         odd=tuple(odd_recordings(views, recordings, parameters, units, is_single)),
     )

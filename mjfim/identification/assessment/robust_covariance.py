@@ -17,7 +17,6 @@ import scipy
 
 from mjfim.arrays import NORMAL_95, Array, record, scaled_pseudo_inverse, scaled_to_unit_diagonal
 from mjfim.optimize.condensed_least_squares import Condensed
-from mjfim.records.estimate import Uncertainty
 
 # Length of an independent block over the autocorrelation time of the residuals.
 LENGTH_PER_CORRELATION_TIME = 4.0
@@ -218,6 +217,34 @@ SMALLEST_VARIANCE = 1e-300
 GROUPS = 4
 
 
+@record
+class Uncertainty:
+    """Robust uncertainty of the c unknowns that all recordings have in common [theta-unit].
+
+    It allows for autocorrelated residuals and for recordings that disagree.
+
+    Attributes:
+        sandwich: (c,) standard deviations that allow for autocorrelated residuals.
+        interval: (c, 2) 95 % intervals, which cover the formal, sandwich and bootstrap intervals.
+        between: (c,) standard deviation between recordings that their standard deviations do not
+            explain.
+        apart: Indices of the unknowns on which recordings disagree.
+        each: (K, c) estimates from each recording alone; NaN where a recording has too little
+            information.
+        draws: (n, c) bootstrap replicates of the estimate.
+        covariance: (c, c) covariance that is in every direction at least the formal one and the
+            sandwich one, without the scatter between recordings.
+    """
+
+    sandwich: Array
+    interval: Array
+    between: Array
+    apart: tuple[int, ...]
+    each: Array
+    draws: Array
+    covariance: Array
+
+
 def robust_uncertainty(
     condensed: Condensed,
     theta: Array,
@@ -300,7 +327,6 @@ def robust_uncertainty(
         between=between,
         apart=tuple(shared[apart].tolist()),
         each=each,
-        blocks=count,
         draws=theta + replicates,
         covariance=covering_covariance(of_noise, factor**2 * of_scatter),
     )
@@ -405,26 +431,27 @@ def _bootstrap(blocks: Blocks, draws: int, rng: np.random.Generator) -> Array:
 
     Draws that do not determine all unknowns are left out.
     """
-    count, c, _ = blocks.equations.shape
-    total = blocks.equations[..., -1].sum(axis=0)
+    count = len(blocks.equations)
     prior_rows = blocks.priors[0][:, :-1]
-    prior_information = prior_rows.T @ prior_rows
-    probabilities = np.full(count, 1.0 / count)
 
-    steps = [np.zeros((0, c))]
+    steps = [np.zeros_like(prior_rows[:0])]
     for first in range(0, draws, REPLICATES_AT_ONCE):
         # Each replicate weights a block by the number of times that it was drawn.
         n = min(REPLICATES_AT_ONCE, draws - first)
-        weights = rng.multinomial(count, probabilities, size=n).astype(np.float64)
-        drawn = np.tensordot(weights, blocks.equations, axes=1)
-        H = drawn[..., :-1] + prior_information
+        drawn = np.tensordot(
+            rng.multinomial(count, np.full(count, 1.0 / count), size=n), blocks.equations, axes=1
+        )
+        H = drawn[..., :-1] + prior_rows.T @ prior_rows
 
         # Priors are drawn as well, from their normal distribution.
-        g = drawn[..., -1] - total + rng.standard_normal((n, len(prior_rows))) @ prior_rows
+        g = (
+            drawn[..., -1]
+            - blocks.equations[..., -1].sum(axis=0)
+            + rng.standard_normal((n, len(prior_rows))) @ prior_rows
+        )
 
         usable = _condition_number(H) < MAX_CONDITION_OF_DRAW
-        solved = np.linalg.solve(H[usable], g[usable][..., None])
-        steps.append(-solved[..., 0])
+        steps.append(-np.linalg.solve(H[usable], g[usable][..., None])[..., 0])
     return np.concatenate(steps)
 
 

@@ -104,24 +104,26 @@ def extended_problem(
 def _extended_segments(problem: FitProblem, wider: FitProblem) -> tuple[Segment, ...]:
     """The segments of a problem with initial states of the extended model."""
     system = wider.system
-    space, known = system.space, KnownActivations.of(system)
-    stated, names = state_names(problem.system.model), state_names(system.model)
+    space = system.space
+    known = KnownActivations.of(system)
+    stated = state_names(problem.system.model)
+    names = state_names(system.model)
     if stated == names:
         return problem.segments
 
     common = [names.index(name) for name in stated]
-    first = space.nq + space.nv
-    added = [k for k, address in enumerate(known.addresses) if first + address not in common]
-    places = [first + known.addresses[k] for k in added]
+    places = space.nq + space.nv + np.array(known.addresses, dtype=np.intp)
+    is_added = ~np.isin(places, common)
 
     segments = []
     for segment in problem.segments:
         start = np.array(system.plant.nominal_initial_state)
         start[common] = segment.start
-        _, qvel, _ = space.split(start)
-        recording = wider.recordings[segment.recording]
-        values = known.at(recording, np.array([segment.begin]), qvel[None])[0]
-        start[places] = values[added]
+        qvel = space.split(start)[1]
+        values = known.at(
+            wider.recordings[segment.recording], np.array([segment.begin]), qvel[None]
+        )[0]
+        start[places[is_added]] = values[is_added]
         segments.append(replace(segment, start=start))
     return tuple(segments)
 

@@ -33,7 +33,7 @@ from mjfim.model.elements import translations
 from mjfim.model.targets import ModelField
 from mjfim.model.units import actuator_gear
 from mjfim.model.variants import RELAXED, Relaxation
-from mjfim.plant.equation_of_motion import EquationOfMotion, EquationTerms, MotionPoints
+from mjfim.plant.equation_of_motion import EquationOfMotion, MotionPoints
 from mjfim.plant.equation_of_motion import activations as simulated_activations
 from mjfim.records.estimate_parts import ResidualForce
 
@@ -284,31 +284,30 @@ class MotionEquations:
         parts = []
         for each in self.recorded:
             points = zip(models, self.points(models, each.motion, thetas), strict=True)
-            parts.append([self._averaged(each, self.equation.terms(*pair)) for pair in points])
+            parts.append([self._averaged(each, *self.equation.terms(*pair)) for pair in points])
         rows = np.concatenate(parts, axis=2)
         rows[~compiled] = np.nan
         return rows
 
-    def forces_along(self, each: RecordedEquations, terms: EquationTerms) -> tuple[Array, Array]:
+    def forces_along(self, each: RecordedEquations, forces: Array) -> tuple[Array, Array]:
         """Forces of the actuators along one recording.
 
         Args:
             each: The equations along the recording.
-            terms: The terms of the equation of motion there.
+            forces: (n, nv+nf) forces by the model, see `EquationOfMotion.terms`.
 
         Returns:
             (n, nv) forces on the degrees of freedom, measured where the recording holds them and by
             the model elsewhere, and (n, f) the forces by the model in place of measured ones
             [N or N m].
         """
-        measured = np.array(terms.actuation)
+        nv = self.system.space.nv
+        measured = forces[:, :nv].copy()
         modelled = np.zeros_like(each.forces)
         for place, force in enumerate(self.forces):
             values = each.forces[:, place]
-            if force.is_of_joint:
-                modelled[:, place] = terms.actuation[:, force.dof]
-            else:
-                modelled[:, place] = terms.actuator_force[:, force.actuator]
+            column = force.dof if force.is_of_joint else nv + force.actuator
+            modelled[:, place] = forces[:, column]
             if each.has_force[place] and force.is_of_joint:
                 measured[:, force.dof] = values
             elif each.has_force[place]:
@@ -316,14 +315,16 @@ class MotionEquations:
                 measured += error[:, None] * each.moments[:, place]
         return measured, modelled
 
-    def _averaged(self, each: RecordedEquations, terms: EquationTerms) -> Array:
+    def _averaged(
+        self, each: RecordedEquations, needed: Array, inertial: Array, forces: Array
+    ) -> Array:
         """(3, r) explained, measured and inertial forces along one recording."""
-        measured, modelled = self.forces_along(each, terms)
+        measured, modelled = self.forces_along(each, forces)
         parts = []
         nothing = np.zeros(len(measured))
         for (_, unit, place), (weights, _, _) in zip(self.equations, each.windows, strict=True):
             if unit:
-                series = [terms.needed[:, place], measured[:, place], terms.inertial[:, place]]
+                series = [needed[:, place], measured[:, place], inertial[:, place]]
             else:
                 series = [modelled[:, place], each.forces[:, place], nothing]
             parts.append(np.stack([weights @ values for values in series]))
@@ -499,6 +500,6 @@ def _residual(
     """(n, nv) forces of the actuators less those that the motion needs, and the former alone."""
     model = equations.system.plant.model(theta)
     (points,) = equations.points([model], each.motion, theta[None])
-    terms = equations.equation.terms(model, points)
-    force, _ = equations.forces_along(each, terms)
-    return force - terms.needed, force
+    needed, _, forces = equations.equation.terms(model, points)
+    force, _ = equations.forces_along(each, forces)
+    return force - needed, force

@@ -360,14 +360,19 @@ class _Search:
                 words = f"{kinds[i].split()[0]}s {names_of[i]} and {names_of[k]} are swapped"
                 yield replace(none.with_entries("order", [i, k], [k, i]), words=words)
 
-    def _cure(self, change: _Change) -> str:
-        """Lines for the experiment file; empty for a trifle."""
+    @property
+    def _columns(self) -> list[list[str]]:
+        """Columns of the log for each actuator, and then for each joint."""
         columns = [[f"ctrl:{name}"] for name in actuator_names(self.system.model)]
         found = measured_states(self.system, self.equations.recorded[0].motion.recording)
         for joint in self.joints:
             places = (joint.q, self.system.space.nq + joint.v)
             columns.append([self.system.outputs.names[found[x]] for x in places if x in found])
+        return columns
 
+    def _cure(self, change: _Change) -> str:
+        """Lines for the experiment file; empty for a trifle."""
+        columns = self._columns
         stated, lines = self.system.experiment.recording.sources, []
         for k, source in enumerate(change.order.tolist()):
             factor, offset = change.factor[k], change.offset[k]
