@@ -11,7 +11,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
-from typing import TYPE_CHECKING, TypeVar
+from typing import TypeVar
 
 import numpy as np
 
@@ -19,6 +19,7 @@ from mjfim.arrays import Array
 from mjfim.errors import RecordingError, SimulationDivergedError
 from mjfim.experiment.system import System
 from mjfim.identification.aligned_recording import align, on_grid_of
+from mjfim.identification.fit_workers import FitWorkers, ProblemWork
 from mjfim.identification.segment_simulation import (
     DivergedSegmentError,
     SegmentBatch,
@@ -40,16 +41,10 @@ from mjfim.plant.outputs import Noise
 from mjfim.plant.plant import SENSITIVITY_STEP
 from mjfim.records.trajectory import Recording
 
-if TYPE_CHECKING:
-    from mjfim.identification.fit_workers import FitWorkers
-
 T = TypeVar("T")
 
 # Work on one batch of a problem, at values of the unknowns. It raises `DivergedSegmentError`.
 BatchWork = Callable[["FitProblem", UnknownValues, SegmentBatch], T]
-
-# A task on a whole problem, which ends early when the budget is exhausted.
-ProblemWork = Callable[["FitProblem", Budget], T]
 
 
 # Number of stated samples of the longest recording along which difference steps are calibrated.

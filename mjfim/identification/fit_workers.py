@@ -16,13 +16,12 @@ from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal, TypeVar, cast
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 
 from mjfim.experiment.system import System, SystemOrder, order_of
 from mjfim.identification.aligned_recording import AlignedRecording
-from mjfim.identification.fit_problem import FitProblem, ProblemWork
 from mjfim.parallel import (
     ExecutorLike,
     Workers,
@@ -35,6 +34,12 @@ from mjfim.parallel.budget import Budget, StopToken, hurried
 from mjfim.parallel.shared_value import KeptPerThread, SharedValue, require_values
 
 T = TypeVar("T")
+
+# A `FitProblem`, which holds its workers.
+Problem = Any
+
+# A task on a whole problem, which ends early when the budget is exhausted.
+ProblemWork = Callable[[Problem, Budget], T]
 
 # Size of a recording above which workers of this computer share its arrays as files [bytes].
 MIN_FILE_BYTES = 2**20
@@ -52,16 +57,14 @@ _SharedRecording = tuple[AlignedRecording, Path | None]
 
 # A problem of this process alone in parts, each of which is sent once: the rest, its system and its
 # recordings.
-_SharedProblem = tuple[
-    FitProblem, SharedValue[SystemOrder], tuple[SharedValue[_SharedRecording], ...]
-]
+_SharedProblem = tuple[Problem, SharedValue[SystemOrder], tuple[SharedValue[_SharedRecording], ...]]
 
 # A problem and a work on it.
 _Order = tuple[SharedValue[_SharedProblem], ProblemWork[T]]
 
 # The latest systems and problems of a worker.
 _systems: KeptPerThread[System] = KeptPerThread(KEPT_PROBLEMS)
-_problems: KeptPerThread[FitProblem] = KeptPerThread(KEPT_PROBLEMS)
+_problems: KeptPerThread[Problem] = KeptPerThread(KEPT_PROBLEMS)
 
 
 @one_blas_thread()
@@ -75,10 +78,10 @@ def _carry_out(order: _Order[T]) -> tuple[T, int]:
 
 
 def _made(
-    problem: FitProblem,
+    problem: Problem,
     system: SharedValue[SystemOrder],
     recordings: tuple[SharedValue[_SharedRecording], ...],
-) -> FitProblem:
+) -> Problem:
     """The problem in a worker; arrays of recordings are read from files when they are used."""
     require_values([system, *recordings])
     found = []
@@ -93,10 +96,10 @@ def _made(
 
 
 def _with_parts(
-    problem: FitProblem, system: System | None, recordings: tuple[AlignedRecording, ...]
-) -> FitProblem:
+    problem: Problem, system: System | None, recordings: tuple[AlignedRecording, ...]
+) -> Problem:
     """A problem of this process alone, with another system and other recordings."""
-    return replace(problem, system=cast(System, system), recordings=recordings, workers=None)
+    return replace(problem, system=system, recordings=recordings, workers=None)
 
 
 class FitWorkers:
@@ -119,7 +122,7 @@ class FitWorkers:
         """Number of workers."""
         return self._executor.count
 
-    def of_batches(self, problem: FitProblem, works: Sequence[ProblemWork[T]]) -> Sequence[T]:
+    def of_batches(self, problem: Problem, works: Sequence[ProblemWork[T]]) -> Sequence[T]:
         """Do works that are one pass over the data.
 
         A request to stop takes effect after the pass. A second Ctrl-C ends what runs on workers,
@@ -141,7 +144,7 @@ class FitWorkers:
         ]
 
     def of_whole(
-        self, problem: FitProblem, works: Sequence[ProblemWork[T]], budget: Budget
+        self, problem: Problem, works: Sequence[ProblemWork[T]], budget: Budget
     ) -> Iterator[T]:
         """Do independent works, each in one worker.
 
@@ -158,18 +161,18 @@ class FitWorkers:
         for found in results(_carry_out, orders, self._executor, budget, here):
             yield self._counted(problem, found)
 
-    def _orders(self, problem: FitProblem, works: Sequence[ProblemWork[T]]) -> list[_Order[T]]:
+    def _orders(self, problem: Problem, works: Sequence[ProblemWork[T]]) -> list[_Order[T]]:
         """Orders for works on a problem."""
         shared = self._shared(problem, self._executor.threads_for(len(works)))
         return [(shared, work) for work in works]
 
-    def _counted(self, problem: FitProblem, found: tuple[T, int]) -> T:
+    def _counted(self, problem: Problem, found: tuple[T, int]) -> T:
         """A result of a worker, whose engine steps are added to those of the problem."""
         result, steps = found
         problem.system.plant.simulator.add_steps(steps)
         return result
 
-    def _shared(self, problem: FitProblem, threads: int) -> SharedValue[_SharedProblem]:
+    def _shared(self, problem: Problem, threads: int) -> SharedValue[_SharedProblem]:
         """A problem as workers with some number of threads receive it."""
 
         def parts() -> tuple[_SharedProblem, int]:

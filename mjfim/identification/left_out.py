@@ -22,7 +22,8 @@ from mjfim.experiment.given import RecordingsLike, recordings_of
 from mjfim.experiment.schema import ExperimentLike
 from mjfim.experiment.system import System
 from mjfim.identification.assessment.honest_covariance import jackknife_std
-from mjfim.identification.fit_problem import FitProblem, ProblemWork
+from mjfim.identification.fit_problem import FitProblem
+from mjfim.identification.fit_workers import ProblemWork
 from mjfim.identification.search import of_subset
 from mjfim.optimize.levenberg_marquardt import (
     WEAK_DAMPING,
