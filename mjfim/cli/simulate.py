@@ -46,8 +46,8 @@ def simulate(
 ) -> None:
     """Simulate a recording of a design at the `true` parameter values, with noise.
 
-    Without a design it is a recording of the initial control, of the references that it states for
-    the control laws, or of the motion of a model without actuators from its initial state.
+    Without a design, the recording is of `initial.control`. Under control laws these are references,
+    and a model without actuators moves freely from its initial state.
     """
     stated = mjfim.Experiment.from_file(experiment)
 

@@ -243,8 +243,7 @@ FIRST_TOLERANCE = 0.1
 FIRST_ROUGH_SHARE = 1e-2
 ROUGH_SHARE = 0.1
 
-# This share where the fit clearly misses much data, even if the cost falls by twice this share.
-# Searches from other starts follow then.
+# This share for a first search whose cost shows a clear misfit: searches from other starts follow.
 MISSED_ROUGH_SHARE = 0.02
 
 # This share where the predictions of a fit are only compared with those of others.

@@ -347,7 +347,9 @@ def stated_candidates(
         stated.append(
             replace(known.get(path, like), name=name, paths=(path,), owners=(), offset=0.0)
         )
-    return [*(each for each in proposed if each.guess is not None and each.offset), *stated]
+    # The delay has a guess, too, and masses that are proposed by themselves have none.
+    asked = [each for each in proposed if each.group == "payload" and each.guess is not None]
+    return [*asked, *stated]
 
 
 def _tied(model: Any, found: Sequence[Candidate]) -> list[Candidate]:

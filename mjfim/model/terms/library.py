@@ -175,7 +175,10 @@ class Payload(Term):
 
     @classmethod
     def shapes(cls, model: Any, element: str, speed: float) -> list[Shape]:
-        """Places on a line through the centre of mass of a body that carries no moving one."""
+        """Two places of a load on the line from a body's origin through its centre of mass.
+
+        There are none where the body has no joint or carries a moving body.
+        """
         body = model.body(element).id
         is_last = not any(
             model.body_weldid[model.body_parentid[other]] == body
@@ -218,8 +221,8 @@ def _axes_with_effect(model: mujoco.MjModel, body: int) -> tuple[int, ...]:
         mujoco.mj_kinematics(model, data)
         directions.append(data.xmat[body].reshape(3, 3).copy())
 
-    # Of the axes of a body that is turned against the hinges, as many have an effect of their own
-    # as there are directions in which a place has one; those with the largest effect come first.
+    # The rank of the changes of the axes is the number of axes with an effect of their own. Pivoting
+    # chooses those with the largest changes.
     turned = np.concatenate(directions[1:]) - np.tile(directions[0], (POSES - 1, 1))
     _, R, order = scipy.linalg.qr(turned, mode="economic", pivoting=True)
     count = int((np.abs(np.diag(R)) > LEAST_TURN).sum())
