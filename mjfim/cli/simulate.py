@@ -46,7 +46,7 @@ def simulate(
 ) -> None:
     """Simulate a recording of a design at the `true` parameter values, with noise.
 
-    Without a design, the recording is of `initial.control`. Under control laws these are references,
+    Without a design, the recording is of `initial.control`. Under control laws this is a reference,
     and a model without actuators moves freely from its initial state.
     """
     stated = mjfim.Experiment.from_file(experiment)

@@ -37,7 +37,7 @@ from mjfim.excitation.search.levels import DescentLevel, require_coarse_factor
 from mjfim.excitation.search.search import Search
 from mjfim.excitation.sensors import sensing_along
 from mjfim.excitation.task import DesignTask
-from mjfim.excitation.task_parts import require_controls
+from mjfim.excitation.task_parts import EarlierExperiments, require_controls
 from mjfim.experiment.arguments import checked
 from mjfim.experiment.schema import ExperimentLike, experiment_of
 from mjfim.experiment.system import labels_of_system
@@ -523,7 +523,7 @@ def design_jointly(
                 others = information[:i] + information[i + 1 :]
                 added = sum(others, start=np.zeros_like(information[i]))
                 design = design_task(
-                    task.restated(task.experiment, added=(added, np.zeros(0), {})),
+                    task.restated(task.experiment, added=EarlierExperiments(information=added)),
                     callback=show,
                     initial_control=None if earlier is None else earlier.trajectory.ctrl,
                     executor=workers,

@@ -22,7 +22,7 @@ from mjfim.excitation.objective import DIVERGED, DesignPoint
 from mjfim.excitation.search.climb import Candidate, row_of
 from mjfim.excitation.search.levels import DescentLevel
 from mjfim.excitation.task import DesignTask
-from mjfim.excitation.task_parts import Known
+from mjfim.excitation.task_parts import EarlierExperiments
 from mjfim.experiment.packing import for_workers
 from mjfim.experiment.schema import Experiment
 from mjfim.optimize.lq import largest_amplification
@@ -203,7 +203,7 @@ class _TimeIsOverError(Exception):
 
 def _made(
     experiment: Experiment,
-    added: Known | None,
+    added: EarlierExperiments | None,
     basis: Array | None,
     space: ReleaseSpace,
     step_factors: Array | None,

@@ -14,7 +14,7 @@ from mjfim.errors import ExperimentError, SimulationDivergedError
 from mjfim.excitation.limits.limits import Limit, ReleaseSpace, limits_of, limits_of_model
 from mjfim.excitation.objective import DesignProblem, RunningCost
 from mjfim.excitation.task_parts import (
-    Known,
+    EarlierExperiments,
     ParameterSamples,
     contrast_of,
     holding_control,
@@ -91,7 +91,7 @@ class DesignTask:
     control_about: Array
     contrast: Array | None
     prior_information: Array
-    added: Known | None
+    added: EarlierExperiments | None
     inflation: Array
     samples_of_parameters: ParameterSamples | None
     release: ReleaseSpace | None
@@ -102,7 +102,7 @@ class DesignTask:
         experiment: ExperimentLike,
         *,
         threads: int | None = None,
-        added: Known | None = None,
+        added: EarlierExperiments | None = None,
     ) -> DesignTask:
         """Resolve an experiment into the task of designing its control.
 
@@ -120,7 +120,7 @@ class DesignTask:
         return cls.of(system, added=added)
 
     @classmethod
-    def of(cls, system: System, *, added: Known | None = None) -> DesignTask:
+    def of(cls, system: System, *, added: EarlierExperiments | None = None) -> DesignTask:
         """Resolve the task that the experiment of a system states.
 
         Args:
@@ -150,7 +150,12 @@ class DesignTask:
 
     @classmethod
     def _made(
-        cls, system: System, control: Array, added: Known | None, *, weighted: bool = True
+        cls,
+        system: System,
+        control: Array,
+        added: EarlierExperiments | None,
+        *,
+        weighted: bool = True,
     ) -> DesignTask:
         """Put a task together; `weighted`: weights or limits have to bound every control."""
         experiment, names = system.experiment, system.controls
@@ -170,16 +175,14 @@ class DesignTask:
 
         with ExitStack() as stack:
             files = [stack.enter_context(opened(experiment, path)) for path in experiment.earlier]
-            prior, inflation, sigma = known_from(files, system.parameters.names)
+            earlier = known_from(files, system.parameters.names)
         if added is not None:
-            prior = prior + added[0]
-            inflation = added[1] if len(added[1]) else inflation
-            sigma |= added[2]
+            earlier = earlier.plus(added)
 
         # The noise with which the inflation was found; a fit may have estimated it.
         stated = system.stated_noise
         found = [
-            sigma.get(output.name, own)
+            earlier.sigma.get(output.name, own)
             for output, own in zip(system.outputs.outputs, stated.sigma, strict=True)
         ]
         factor = np.array(found) / stated.sigma
@@ -194,9 +197,9 @@ class DesignTask:
             control_weight=weight,
             control_about=about,
             contrast=contrast_of(system),
-            prior_information=prior,
+            prior_information=earlier.information,
             added=added,
-            inflation=inflation,
+            inflation=earlier.inflation,
             samples_of_parameters=parameter_samples_of(system),
             release=ReleaseSpace.of(system, limits),
         )
@@ -601,7 +604,9 @@ class DesignTask:
         system, reference = _calibrated(changed, averaged, known=self)
         return replace(self, system=system, control=averaged, reference=reference)
 
-    def restated(self, experiment: Experiment, *, added: Known | None = None) -> DesignTask:
+    def restated(
+        self, experiment: Experiment, *, added: EarlierExperiments | None = None
+    ) -> DesignTask:
         """The task of another experiment on this model, which is not parsed again."""
         system = System.resolve(experiment, threads=self.system.threads, source=self.system.source)
         return DesignTask.of(system, added=added)

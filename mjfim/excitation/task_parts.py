@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import field
 from pathlib import Path
 from typing import Any, Literal
 
@@ -365,13 +366,30 @@ def parameter_samples_of(system: System) -> ParameterSamples | None:
     return ParameterSamples(thetas=thetas, over=robust.over, logarithmic=logarithmic)
 
 
-# What other experiments tell about p parameters, and how well: (p, p) information [1 / (unit of
-# theta_i times unit of theta_j)]; (p,) inflation of the standard deviations, at least 1, and empty
-# without an estimate; standard deviations of the noise for which it holds, by output [output unit].
-Known = tuple[Array, Array, dict[str, float]]
+@record
+class EarlierExperiments:
+    """What other experiments tell about p parameters, and how well.
+
+    Attributes:
+        information: (p, p) information without priors [1 / (theta_i theta_j unit)].
+        inflation: (p,) factors on standard deviations, at least 1; empty without an estimate.
+        sigma: Noise for which the inflation holds, by output [output unit].
+    """
+
+    information: Array
+    inflation: Array = field(default_factory=lambda: np.zeros(0))
+    sigma: dict[str, float] = field(default_factory=dict)
+
+    def plus(self, other: EarlierExperiments) -> EarlierExperiments:
+        """Both together; the inflation is that of the latter, if it has one."""
+        return EarlierExperiments(
+            information=self.information + other.information,
+            inflation=other.inflation if len(other.inflation) else self.inflation,
+            sigma=self.sigma | other.sigma,
+        )
 
 
-def known_from(paths: Sequence[Path], names: Sequence[str]) -> Known:
+def known_from(paths: Sequence[Path], names: Sequence[str]) -> EarlierExperiments:
     """What earlier experiments tell about the named parameters, and how well.
 
     The information is their sum, without their priors. Further parameters of a file are
@@ -417,7 +435,7 @@ def known_from(paths: Sequence[Path], names: Sequence[str]) -> Known:
             ratios.append(np.full(len(names), np.nan))
             ratios[-1][here] = ratio[there]
         sigma |= noise
-    return total, expected_inflation(ratios), sigma
+    return EarlierExperiments(information=total, inflation=expected_inflation(ratios), sigma=sigma)
 
 
 # Variance of the logarithm of a standard deviation with three degrees of freedom: honest ones come

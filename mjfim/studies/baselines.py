@@ -22,7 +22,7 @@ from mjfim.excitation.search.inside import largest_share
 from mjfim.excitation.search.levels import DescentLevel
 from mjfim.excitation.search.search import Search
 from mjfim.excitation.task import DesignTask
-from mjfim.excitation.task_parts import Known
+from mjfim.excitation.task_parts import EarlierExperiments
 from mjfim.experiment.schema import Experiment
 from mjfim.parallel import one_blas_thread, pool_stop_token
 from mjfim.parallel.budget import Budget, StopToken
@@ -236,7 +236,7 @@ class BaselineSearch:
     seed: int = 0
     part: tuple[int, int] = (0, 1)
     combinations: Array | None = None
-    added: Known | None = None
+    added: EarlierExperiments | None = None
     threads: int | None = None
 
     def generator(self) -> np.random.Generator:

@@ -35,7 +35,7 @@ from mjfim.excitation.shortest_horizon import (
     target_accuracies,
 )
 from mjfim.excitation.task import DesignTask
-from mjfim.excitation.task_parts import Known, expected_inflation
+from mjfim.excitation.task_parts import EarlierExperiments, expected_inflation
 from mjfim.experiment.arguments import checked
 from mjfim.experiment.given import RecordingsLike, recordings_of
 from mjfim.experiment.schema import Experiment, ExperimentLike, experiment_of
@@ -62,11 +62,11 @@ SAMPLING_RANGE = 2.5
 MIN_SAMPLING_RANGE = 1e-9
 
 
-def _known(estimate: Estimate) -> Known:
+def _known(estimate: Estimate) -> EarlierExperiments:
     """What the recordings so far tell, with the noise and the residuals that they show."""
     with np.errstate(divide="ignore", invalid="ignore"):
         inflation = expected_inflation([estimate.honest_std / estimate.std])
-    return estimate.data, inflation, estimate.sigma
+    return EarlierExperiments(information=estimate.data, inflation=inflation, sigma=estimate.sigma)
 
 
 def _information_weight(base: DesignTask, moved: Experiment, rounds: Sequence[Round]) -> float:

@@ -9,6 +9,7 @@ import mjfim
 from mjfim.errors import ExperimentError, UnidentifiableError
 from mjfim.excitation.design import design_task
 from mjfim.excitation.task import DesignTask
+from mjfim.excitation.task_parts import EarlierExperiments
 from tests.support.numerics import CART_PARAMETERS, cart_task, relative_error
 
 NEAR = {
@@ -61,7 +62,7 @@ def test_one_experiment_may_reveal_what_another_cannot(tmp_path) -> None:
     helped = design_task(
         DesignTask.resolve(
             blind.experiment.replace(descent={"max_iterations": 2}),
-            added=(information, np.zeros(0), {}),
+            added=EarlierExperiments(information=information),
         )
     )
     assert np.isfinite(helped.final.std).all()

@@ -72,9 +72,10 @@ KNOWN = {
 def test_what_a_file_knows_is_found_by_name(case: str, tmp_path: Path) -> None:
     names, matrix, prior, asked, wanted = KNOWN[case]
     path = design_file(tmp_path / "design.json", names, matrix, prior)
-    assert_allclose(known_from([path], tuple(asked))[0], wanted, rtol=1e-11, atol=1e-12)
-    assert_allclose(known_from([path, path], tuple(asked))[0], 2.0 * wanted, rtol=1e-11, atol=1e-12)
-    assert not known_from([], tuple(asked))[0].any()
+    assert_allclose(known_from([path], tuple(asked)).information, wanted, rtol=1e-11, atol=1e-12)
+    twice = known_from([path, path], tuple(asked)).information
+    assert_allclose(twice, 2.0 * wanted, rtol=1e-11, atol=1e-12)
+    assert not known_from([], tuple(asked)).information.any()
 
 
 def estimate_file(path: Path, names: list[str], honest: list[float | None], **more: object) -> Path:
@@ -92,18 +93,19 @@ def test_estimates_tell_how_much_wider_honest_deviations_are(tmp_path: Path) -> 
     """
     first = estimate_file(tmp_path / "1.json", ["b", "a", "c"], [0.2, 3.0, None], sigma={"y": 2.0})
     second = estimate_file(tmp_path / "2.json", ["a", "d"], [4.0, 0.05])
-    _, inflation, sigma = known_from([first, second], ("a", "b", "c", "d"))
+    known = known_from([first, second], ("a", "b", "c", "d"))
     logs = np.log([np.sqrt((30.0**2 + 40.0**2) / 2.0), 2.0, 1.0])
     # The variance of the logarithm of a standard deviation of four normal values, by its theory.
     chance = polygamma(1, 1.5) / 4.0
     kept = 1.0 - chance / np.var(logs)
     wanted = np.exp(logs.mean() + kept * (logs - logs.mean()))
-    assert_allclose(inflation[[0, 1, 3]], wanted, rtol=2e-3)
-    assert inflation[2] == pytest.approx(np.exp(logs.mean()))
+    assert_allclose(known.inflation[[0, 1, 3]], wanted, rtol=2e-3)
+    assert known.inflation[2] == pytest.approx(np.exp(logs.mean()))
     alike = estimate_file(tmp_path / "3.json", ["a", "b"], [0.2, 0.3])
-    assert_allclose(known_from([alike], ("a", "b"))[1], np.sqrt(6.0), rtol=1e-12)
-    assert sigma == {"y": 2.0}
-    assert not len(known_from([design_file(tmp_path / "d.json", ["a"], np.eye(1))], ("a",))[1])
+    assert_allclose(known_from([alike], ("a", "b")).inflation, np.sqrt(6.0), rtol=1e-12)
+    assert known.sigma == {"y": 2.0}
+    design = design_file(tmp_path / "d.json", ["a"], np.eye(1))
+    assert not len(known_from([design], ("a",)).inflation)
 
 
 def test_sigma_is_that_of_the_residuals_of_an_earlier_estimate(tmp_path: Path) -> None:
@@ -162,7 +164,7 @@ def test_unusable_files_are_named(name: str, tmp_path: Path) -> None:
     if text is not None:
         path.write_text(text, encoding="utf-8")
     with pytest.raises(ExperimentError, match=rf"earlier: .*odd\.json: .*{message}"):
-        known_from([path], ("a", "b"))[0]
+        known_from([path], ("a", "b")).information
 
 
 def test_a_design_that_was_written_is_read_back(tmp_path: Path) -> None:
@@ -180,7 +182,7 @@ def test_a_design_that_was_written_is_read_back(tmp_path: Path) -> None:
     again = design_task(second)
     archive.write_data(tmp_path / "two", again, second.system)
     files = [tmp_path / number / "design.json" for number in ("one", "two")]
-    total = known_from(files, ("c", "m"))[0]
+    total = known_from(files, ("c", "m")).information
     assert_allclose(total, again.final.information - np.diag([0.25, 0.0]), rtol=1e-8)
     with pytest.raises(ExperimentError, match=r"experiment: earlier: .*gone\.json"):
         cart_task(tmp_path, earlier=("gone.json",))

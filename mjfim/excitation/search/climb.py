@@ -20,7 +20,7 @@ from mjfim.excitation.search.descent import Barrier, FreeMemory, Ground, Step
 from mjfim.excitation.search.inside import InsideSearch, with_corrected_end
 from mjfim.excitation.search.levels import DescentLevel
 from mjfim.excitation.task import DesignTask
-from mjfim.excitation.task_parts import Known
+from mjfim.excitation.task_parts import EarlierExperiments
 from mjfim.experiment.schema import Experiment
 from mjfim.model.variants import ModelVariant
 from mjfim.parallel import (
@@ -240,7 +240,7 @@ def made_grounds(
     experiment: Experiment,
     variant: ModelVariant,
     combinations: Array | None,
-    added: Known | None,
+    added: EarlierExperiments | None,
     threads: int,
 ) -> Grounds:
     """Make the levels of a design in a worker."""

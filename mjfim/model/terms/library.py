@@ -221,7 +221,7 @@ def _axes_with_effect(model: mujoco.MjModel, body: int) -> tuple[int, ...]:
         mujoco.mj_kinematics(model, data)
         directions.append(data.xmat[body].reshape(3, 3).copy())
 
-    # The rank of the changes of the axes is the number of axes with an effect of their own. Pivoting
+    # As many axes have an effect of their own as the changes of all axes have rank. Pivoting
     # chooses those with the largest changes.
     turned = np.concatenate(directions[1:]) - np.tile(directions[0], (POSES - 1, 1))
     _, R, order = scipy.linalg.qr(turned, mode="economic", pivoting=True)
