@@ -523,7 +523,7 @@ def design_jointly(
                 others = information[:i] + information[i + 1 :]
                 added = sum(others, start=np.zeros_like(information[i]))
                 design = design_task(
-                    task.restated(task.experiment, added_information=added),
+                    task.restated(task.experiment, added=(added, np.zeros(0), {})),
                     callback=show,
                     initial_control=None if earlier is None else earlier.trajectory.ctrl,
                     executor=workers,

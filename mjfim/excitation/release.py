@@ -22,6 +22,7 @@ from mjfim.excitation.objective import DIVERGED, DesignPoint
 from mjfim.excitation.search.climb import Candidate, row_of
 from mjfim.excitation.search.levels import DescentLevel
 from mjfim.excitation.task import DesignTask
+from mjfim.excitation.task_parts import Known
 from mjfim.experiment.packing import for_workers
 from mjfim.experiment.schema import Experiment
 from mjfim.optimize.lq import largest_amplification
@@ -202,14 +203,14 @@ class _TimeIsOverError(Exception):
 
 def _made(
     experiment: Experiment,
-    added: Array | None,
+    added: Known | None,
     basis: Array | None,
     space: ReleaseSpace,
     step_factors: Array | None,
     threads: int,
 ) -> Releases:
     """Make the evaluation in a worker."""
-    task = DesignTask.resolve(experiment, threads=threads, added_information=added)
+    task = DesignTask.resolve(experiment, threads=threads, added=added)
     plant = task.plant.with_step_factors(step_factors)
     return Releases(stage=DescentLevel(task, basis), space=space, plant=plant)
 
@@ -382,7 +383,7 @@ class ReleaseSearch:
         return partial(
             _made,
             for_workers(task.experiment, task.system.source),
-            task.added_information,
+            task.added,
             releases.stage.basis,
             releases.space,
             releases.plant.step_factors,

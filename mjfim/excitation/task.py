@@ -14,6 +14,7 @@ from mjfim.errors import ExperimentError, SimulationDivergedError
 from mjfim.excitation.limits.limits import Limit, ReleaseSpace, limits_of, limits_of_model
 from mjfim.excitation.objective import DesignProblem, RunningCost
 from mjfim.excitation.task_parts import (
+    Known,
     ParameterSamples,
     contrast_of,
     holding_control,
@@ -71,8 +72,8 @@ class DesignTask:
             sums, or None.
         prior_information: (p, p) information of earlier experiments, without the priors of the
             parameters.
-        added_information: (p, p) part of the prior information that the caller added to that of the
-            experiment's `earlier` files, or None.
+        added: What the caller added to the information of the experiment's `earlier` files, or
+            None.
         inflation: (p,) factors by which residuals like those of earlier estimates widen standard
             deviations; empty where there is no earlier estimate.
         samples_of_parameters: Parameter values over which a robust design pools its criterion, or
@@ -90,7 +91,7 @@ class DesignTask:
     control_about: Array
     contrast: Array | None
     prior_information: Array
-    added_information: Array | None
+    added: Known | None
     inflation: Array
     samples_of_parameters: ParameterSamples | None
     release: ReleaseSpace | None
@@ -101,15 +102,14 @@ class DesignTask:
         experiment: ExperimentLike,
         *,
         threads: int | None = None,
-        added_information: Array | None = None,
+        added: Known | None = None,
     ) -> DesignTask:
         """Resolve an experiment into the task of designing its control.
 
         Args:
             experiment: The experiment as the user states it.
             threads: Threads for the engine; default: one per core.
-            added_information: (p, p) information of other experiments besides the stated `earlier`
-                files.
+            added: What other experiments tell besides the stated `earlier` files.
 
         Raises:
             ExperimentError: Something is wrong or missing in the experiment; the message names the
@@ -117,16 +117,15 @@ class DesignTask:
             ModelError: The model cannot be used.
         """
         system = System.resolve(experiment, threads=threads)
-        return cls.of(system, added_information=added_information)
+        return cls.of(system, added=added)
 
     @classmethod
-    def of(cls, system: System, *, added_information: Array | None = None) -> DesignTask:
+    def of(cls, system: System, *, added: Known | None = None) -> DesignTask:
         """Resolve the task that the experiment of a system states.
 
         Args:
             system: The system.
-            added_information: (p, p) information of other experiments besides the stated `earlier`
-                files.
+            added: What other experiments tell besides the stated `earlier` files.
 
         Raises:
             ExperimentError: Something is wrong or missing in the experiment; the message names the
@@ -134,7 +133,7 @@ class DesignTask:
         """
         require_design_keys(system)
         with named_file(system.experiment):
-            return cls._made(system, stated_control(system), added_information)
+            return cls._made(system, stated_control(system), added)
 
     @classmethod
     def along(cls, system: System, control: Array) -> DesignTask:
@@ -151,7 +150,7 @@ class DesignTask:
 
     @classmethod
     def _made(
-        cls, system: System, control: Array, added: Array | None, *, weighted: bool = True
+        cls, system: System, control: Array, added: Known | None, *, weighted: bool = True
     ) -> DesignTask:
         """Put a task together; `weighted`: weights or limits have to bound every control."""
         experiment, names = system.experiment, system.controls
@@ -173,7 +172,9 @@ class DesignTask:
             files = [stack.enter_context(opened(experiment, path)) for path in experiment.earlier]
             prior, inflation, sigma = known_from(files, system.parameters.names)
         if added is not None:
-            prior = prior + added
+            prior = prior + added[0]
+            inflation = added[1] if len(added[1]) else inflation
+            sigma |= added[2]
 
         # The noise with which the inflation was found; a fit may have estimated it.
         stated = system.stated_noise
@@ -194,7 +195,7 @@ class DesignTask:
             control_about=about,
             contrast=contrast_of(system),
             prior_information=prior,
-            added_information=added,
+            added=added,
             inflation=inflation,
             samples_of_parameters=parameter_samples_of(system),
             release=ReleaseSpace.of(system, limits),
@@ -600,12 +601,10 @@ class DesignTask:
         system, reference = _calibrated(changed, averaged, known=self)
         return replace(self, system=system, control=averaged, reference=reference)
 
-    def restated(
-        self, experiment: Experiment, *, added_information: Array | None = None
-    ) -> DesignTask:
+    def restated(self, experiment: Experiment, *, added: Known | None = None) -> DesignTask:
         """The task of another experiment on this model, which is not parsed again."""
         system = System.resolve(experiment, threads=self.system.threads, source=self.system.source)
-        return DesignTask.of(system, added_information=added_information)
+        return DesignTask.of(system, added=added)
 
     def coarser(self, factor: int) -> DesignTask:
         """This task with a timestep and a sample period that are `factor` times longer."""

@@ -365,9 +365,13 @@ def parameter_samples_of(system: System) -> ParameterSamples | None:
     return ParameterSamples(thetas=thetas, over=robust.over, logarithmic=logarithmic)
 
 
-def known_from(
-    paths: Sequence[Path], names: Sequence[str]
-) -> tuple[Array, Array, dict[str, float]]:
+# What other experiments tell about p parameters, and how well: (p, p) information [1 / (unit of
+# theta_i times unit of theta_j)]; (p,) inflation of the standard deviations, at least 1, and empty
+# without an estimate; standard deviations of the noise for which it holds, by output [output unit].
+Known = tuple[Array, Array, dict[str, float]]
+
+
+def known_from(paths: Sequence[Path], names: Sequence[str]) -> Known:
     """What earlier experiments tell about the named parameters, and how well.
 
     The information is their sum, without their priors. Further parameters of a file are
@@ -383,11 +387,6 @@ def known_from(
     Args:
         paths: Files design.json and estimate.json.
         names: Names of the p parameters.
-
-    Returns:
-        (p, p) information [1 / (unit of theta_i times unit of theta_j)]; (p,) inflation of the
-        standard deviations, at least 1, and empty without an estimate; standard deviations of the
-        noise for which it holds, by output [output unit].
 
     Raises:
         ExperimentError: A file cannot be used; the message names it.

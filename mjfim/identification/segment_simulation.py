@@ -184,7 +184,8 @@ class SegmentSimulation(FitUnknowns):
         plant, segment = self.system.plant, self.segments[index]
         theta = self.theta_of_recording(at, segment.recording)
         start = self.initial_state(at, index)[None]
-        lead = plant.lead(theta)
+        # Before the begin of a recording, its first inputs are held.
+        lead = min(plant.lead(theta), segment.begin + 1)
         inputs = self._control(index, samples, lead)[None]
         context = None
         if plant.laws is not None:
@@ -277,8 +278,8 @@ class SegmentSimulation(FitUnknowns):
         None where a simulation diverges.
         """
         longest = max(self.segments[i].samples for i in batch.segments)
-        lead = self.system.plant.lead(theta)
         begins = np.array([self.segments[i].begin for i in batch.segments])
+        lead = min(self.system.plant.lead(theta), int(begins.max()) + 1)
         return self.system.plant.derivatives.responses(
             theta,
             np.stack([self.initial_state(at, i) for i in batch.segments]),

@@ -29,8 +29,10 @@ from mjfim.plant.running_law import (
     LawNumbers,
     RunningLaws,
     Ticks,
+    distinct_curves,
     lead_time,
     memory_at_begin,
+    of_curves,
 )
 from mjfim.plant.state_space import StateSizes
 
@@ -248,7 +250,18 @@ class ClosedLoopSimulator(BatchSimulator):
         numbers = LawNumbers.of(models, laws, count)
         window = np.concatenate([context.before, ctrl, context.after], axis=1)
         known = None if context.memory is None else context.memory[index]
-        commands = LawCommands.of(laws, numbers, window, lead, ticks, known)
+        # Most simulations of a derivative share inputs and all numbers that commands depend on.
+        # Their commands are computed once.
+        firsts, place = distinct_curves(laws, numbers, window, known)
+        distinct = LawCommands.of(
+            laws,
+            of_curves(numbers, firsts),
+            window[firsts],
+            lead,
+            ticks,
+            None if known is None else of_curves(known, firsts),
+        )
+        commands = of_curves(distinct, place)
         if known is None:
             sums = self._measured_sums(laws, ctrl, context)
             velocities = [law.v + self.space.nq for law in laws]

@@ -29,7 +29,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import scipy
@@ -198,45 +198,6 @@ class LawCommands:
             ticks: The evaluations.
             memory: What the laws remember at the begin of the curves; None where these begin.
         """
-        # Most simulations of a derivative share inputs and all numbers that commands depend on.
-        # Their commands are computed once.
-        read = sorted({column for law in laws for column in law.columns.values()})
-        deciding = [window[:, :, read], *(getattr(numbers, name) for name in DECIDING_NUMBERS)]
-        if memory is not None:
-            deciding += [memory.reference, memory.profile_velocity]
-        places: dict[bytes, int] = {}
-        place = [
-            places.setdefault(b"".join(part.tobytes() for part in parts), len(places))
-            for parts in zip(*deciding, strict=True)
-        ]
-        first = np.unique(place, return_index=True)[1]
-        distinct = cls._of_distinct(
-            laws,
-            LawNumbers(**{name: getattr(numbers, name)[first] for name in NUMBERS}),
-            window[first],
-            lead,
-            ticks,
-            None if memory is None else memory.of_curves(first),
-        )
-        # Curves are the last axis but one of all arrays.
-        shared: dict[str, Any] = {
-            field.name: np.take(value, place, axis=-2)
-            for field in fields(cls)
-            if isinstance(value := getattr(distinct, field.name), np.ndarray)
-        }
-        return replace(distinct, **shared)
-
-    @classmethod
-    def _of_distinct(
-        cls,
-        laws: Sequence[ControlLaw],
-        numbers: LawNumbers,
-        window: Array,
-        lead: int,
-        ticks: Ticks,
-        memory: LawMemory | None,
-    ) -> LawCommands:
-        """The commands, where each curve has others."""
         columns = _Columns(laws=laws, window=window, lead=lead, ticks=ticks)
         latency = numbers.latency / (ticks.substeps * ticks.timestep)
         shares = filter_shares(numbers.time_constant, ticks.seconds)
@@ -489,14 +450,40 @@ class LawMemory:
     positions: Array
     velocities: Array
 
-    def of_curves(self, curves: np.ndarray) -> LawMemory:
-        """The memory for some of the curves."""
-        return LawMemory(
-            **{
-                each.name: np.take(getattr(self, each.name), curves, axis=-2)
-                for each in fields(self)
-            }
-        )
+
+PerCurve = TypeVar("PerCurve", LawNumbers, LawCommands, LawMemory)
+
+
+def of_curves(arrays: PerCurve, curves: Sequence[int]) -> PerCurve:
+    """Choose curves, which are the last axis but one of all arrays."""
+    values = {each.name: getattr(arrays, each.name) for each in fields(arrays)}
+    chosen: dict[str, Any] = {
+        name: np.take(value, curves, axis=-2)
+        for name, value in values.items()
+        if isinstance(value, np.ndarray)
+    }
+    return replace(arrays, **chosen)
+
+
+def distinct_curves(
+    laws: Sequence[ControlLaw], numbers: LawNumbers, window: Array, memory: LawMemory | None
+) -> tuple[list[int], list[int]]:
+    """First curve with each kind of commands, and for each curve the place of its kind.
+
+    Args:
+        laws: The c laws.
+        numbers: Their numbers.
+        window: (m, W, w) inputs of samples.
+        memory: What the laws remember at the begin of the curves; None where these begin.
+    """
+    read = sorted({column for law in laws for column in law.columns.values()})
+    deciding = [window[:, :, read], *(getattr(numbers, name) for name in DECIDING_NUMBERS)]
+    if memory is not None:
+        deciding += [memory.reference, memory.profile_velocity]
+    keys = [b"".join(part.tobytes() for part in parts) for parts in zip(*deciding, strict=True)]
+    firsts = {key: curve for curve, key in reversed(list(enumerate(keys)))}
+    places = {key: place for place, key in enumerate(firsts)}
+    return list(firsts.values()), [places[key] for key in keys]
 
 
 @record

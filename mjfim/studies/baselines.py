@@ -22,6 +22,7 @@ from mjfim.excitation.search.inside import largest_share
 from mjfim.excitation.search.levels import DescentLevel
 from mjfim.excitation.search.search import Search
 from mjfim.excitation.task import DesignTask
+from mjfim.excitation.task_parts import Known
 from mjfim.experiment.schema import Experiment
 from mjfim.parallel import one_blas_thread, pool_stop_token
 from mjfim.parallel.budget import Budget, StopToken
@@ -225,7 +226,7 @@ class BaselineSearch:
         seed: Seed of its random numbers.
         part: Number of this search among those of one baseline, and how many there are.
         combinations: Basis of the identifiable combinations; None where all are identifiable.
-        added_information: (p, p) information of other experiments.
+        added: What other experiments tell, besides the stated `earlier` files.
         threads: Number of threads; None for all.
     """
 
@@ -235,7 +236,7 @@ class BaselineSearch:
     seed: int = 0
     part: tuple[int, int] = (0, 1)
     combinations: Array | None = None
-    added_information: Array | None = None
+    added: Known | None = None
     threads: int | None = None
 
     def generator(self) -> np.random.Generator:
@@ -247,7 +248,7 @@ class BaselineSearch:
         return DesignTask.resolve(
             self.experiment.replace(**tables),
             threads=self.threads,
-            added_information=self.added_information,
+            added=self.added,
         )
 
 

@@ -15,7 +15,7 @@ effort than the one before, and a round at values below the guess less than the 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -35,7 +35,7 @@ from mjfim.excitation.shortest_horizon import (
     target_accuracies,
 )
 from mjfim.excitation.task import DesignTask
-from mjfim.excitation.task_parts import expected_inflation
+from mjfim.excitation.task_parts import Known, expected_inflation
 from mjfim.experiment.arguments import checked
 from mjfim.experiment.given import RecordingsLike, recordings_of
 from mjfim.experiment.schema import Experiment, ExperimentLike, experiment_of
@@ -62,6 +62,13 @@ SAMPLING_RANGE = 2.5
 MIN_SAMPLING_RANGE = 1e-9
 
 
+def _known(estimate: Estimate) -> Known:
+    """What the recordings so far tell, with the noise and the residuals that they show."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        inflation = expected_inflation([estimate.honest_std / estimate.std])
+    return estimate.data, inflation, estimate.sigma
+
+
 def _information_weight(base: DesignTask, moved: Experiment, rounds: Sequence[Round]) -> float:
     """Weight of the criterion that keeps the balance between information and effort.
 
@@ -73,7 +80,7 @@ def _information_weight(base: DesignTask, moved: Experiment, rounds: Sequence[Ro
         return stated * count
 
     first_task = base.restated(restate_experiment(base, rounds[0].theta))
-    task = base.restated(moved, added_information=rounds[-1].estimate.data)
+    task = base.restated(moved, added=_known(rounds[-1].estimate))
     try:
         first = criterion_of(first_task, rounds[0].control)
         last = criterion_of(task, rounds[-1].control)
@@ -353,24 +360,17 @@ class _CampaignRun:
         """
         base, last = self.base, self.rounds[-1]
         estimate = last.estimate
-        with np.errstate(divide="ignore", invalid="ignore"):
-            inflation = expected_inflation([estimate.honest_std / estimate.std])
         moved = restate_experiment(base, theta, last.estimate)
         moved = moved.replace(cost={"information": _information_weight(base, moved, self.rounds)})
-
-        def task_of(stated: Experiment) -> DesignTask:
-            """The task with what the recordings so far tell, and the residuals that they show."""
-            task = base.restated(stated, added_information=estimate.data)
-            return replace(task, inflation=inflation)
-
-        task = task_of(moved)
+        known = _known(estimate)
+        task = base.restated(moved, added=known)
         first = self._designed(task, executor=self.executor)
         if last.control.shape != task.control.shape or first.status is Status.INTERRUPTED:
             return first
 
         # The second design starts at the control of the last design, and nowhere else.
         only_start = {"starts": 1, "previous": (), "fourier": (), "repeats": ()}
-        task = task_of(moved.replace(descent=only_start))
+        task = base.restated(moved.replace(descent=only_start), added=known)
         try:
             second = self._designed(task, initial_control=last.control)
         except SimulationDivergedError:

@@ -106,7 +106,7 @@ def compare(
         seconds=seconds,
         seed=seed,
         combinations=evaluation.stage.basis,
-        added_information=task.added_information,
+        added=task.added,
         threads=task.system.threads,
     )
 

@@ -71,13 +71,18 @@ fit = { segments = "whole", start = "measured" }
 OUTPUT = """noise."qpos:JOINT" = 0.004
 nuisance.bias."qpos:JOINT" = 0.02
 """
-# Servos are alike, so that they share three numbers. Gravity at the lift and the elbow determines
-# the gain from an angle to a torque. The gripper's largest duty is its own.
+# Servos are alike, so that they share four numbers. Gravity at the lift and the elbow determines
+# the gain from an angle to a torque. The gain kd acts on the change of the error: without it, jumps
+# come too early. The gripper's largest duty is its own.
 SHARED = """
 [parameters.kp]
 targets = [KPS]
-guess = 16.0
+guess = 10.0
 bounds = [0.3, 200.0]
+[parameters.kd]
+targets = [KDS]
+guess = 0.1
+bounds = [0.0, 5.0]
 [parameters.armature]
 targets = [ARMATURES]
 guess = 0.005
@@ -100,19 +105,21 @@ LIMIT = (
 # 0.24 rad in one log pass faster than such a profile; all other changes are below 0.08.
 JOINT = """
 [controllers.JOINT]
-kp = 16.0
+kp = 10.0
+kd = 0.1
+reference_velocity = "difference"
 rate = 249.25224327018943
-latency = 0.005
+latency = 0.012
 acceleration = ACCELERATION
 jump = 0.1
 saturation = [-2.0, 2.0]            # the largest duty of the servo
 [parameters.latency_JOINT]
 target = "controller/JOINT:latency"
-guess = 0.005
+guess = 0.012
 bounds = [0.0, 0.06]
 [parameters.damping_JOINT]
 target = "joint/JOINT:damping"
-guess = 0.8
+guess = 0.5
 bounds = [0.0, 10.0]
 [parameters.friction_JOINT]
 target = "joint/JOINT:frictionloss"
@@ -180,6 +187,7 @@ def main() -> int:
     duty = [LIMIT.replace("JOINT", joint) for joint in JOINTS]
     shared = {
         "KPS": ", ".join(f'{{ path = "controller/{joint}:kp" }}' for joint in JOINTS),
+        "KDS": ", ".join(f'{{ path = "controller/{joint}:kd" }}' for joint in JOINTS),
         "ARMATURES": ", ".join(f'{{ path = "joint/{joint}:armature" }}' for joint in JOINTS),
         "LIMITS": ", ".join(duty[:-1]),
         "LIMIT_OF_GRIPPER": duty[-1],
@@ -237,6 +245,9 @@ def main() -> int:
             for gain, _, kd, armature, friction, damping in published:
                 top = {"damping": damping - kd, "friction": friction, "armature": armature}[name]
                 others.append(f"{scale * top[number] / gain[number]:.3g}")
+            # Both the joint and the servo brake.
+            braking = found.theta[places["kd"]] if name == "damping" else 0.0
+            value, low, high = np.array([value, low, high]) + braking
             value, low, high = scale * np.array([value, low, high]) / found.theta[places["kp"]]
             ours = f"{value:.3g} ({low:.2g} to {high:.2g})"
             cells.append(f"{ours} | {', '.join(others)}")

@@ -60,7 +60,8 @@ def test_one_experiment_may_reveal_what_another_cannot(tmp_path) -> None:
     information = seeing.problem.point(seeing.initial).information
     helped = design_task(
         DesignTask.resolve(
-            blind.experiment.replace(descent={"max_iterations": 2}), added_information=information
+            blind.experiment.replace(descent={"max_iterations": 2}),
+            added=(information, np.zeros(0), {}),
         )
     )
     assert np.isfinite(helped.final.std).all()

@@ -107,6 +107,25 @@ def test_a_limit_that_the_law_hardly_reaches_leaves_the_others_determined(
     assert any("not identifiable separately: limit" in sentence for sentence in found.warnings)
 
 
+def test_a_latency_longer_than_the_log_holds_the_first_reference() -> None:
+    """A search without bounds may try it."""
+    late = {**GAINS["latency"], "guess": 1e15, "nuisance": False}
+    laws = {"shoulder": SHOULDER, "elbow": ELBOW}
+    experiment = arm_experiment(
+        laws, parameters={"latency": late}, noise=NOISE, fit={"segments": 0.1}
+    )
+    system, log = System.resolve(experiment), log_of(experiment, 200, 1)
+    held = replace(log, ctrl=np.broadcast_to(log.ctrl[0], log.ctrl.shape))
+    late_cost, held_cost = (
+        problem.cost(problem.begin(theta))
+        for problem, theta in (
+            (FitProblem.of(system, [log]), np.array([1e15])),
+            (FitProblem.of(system, [held]), np.array([0.0])),
+        )
+    )
+    assert late_cost == held_cost
+
+
 def test_derivatives_agree_with_differences_of_a_plain_loop() -> None:
     """By gains and all times of the law, of a simulation and of a fit."""
     numbers = {

@@ -156,6 +156,18 @@ def test_friction_that_the_model_lacks_makes_the_result_doubtful(tmp_path: Path)
     assert any("misfit" in sentence for sentence in found.warnings)
 
 
+def test_a_redesign_expects_the_noise_that_the_recordings_show() -> None:
+    loud = STUDY.replace(noise={"state": 4.0 * STUDY.noise["state"]})
+    estimated = STUDY.replace(fit={"noise": "estimated", "bootstrap": 0})
+    found = mjfim.run_campaign(
+        estimated, lambda d, k: mjfim.simulate(loud, d.trajectory, seed=k), rounds=2
+    )
+    first, last = found.rounds
+    assert last.design is not None
+    told = last.estimate.data - first.estimate.data
+    assert_allclose(np.diag(last.design.data), np.diag(told), rtol=0.3)
+
+
 def earlier(campaign: Campaign) -> EarlierRound:
     """The first round, as another call reads it from its folder."""
     first = campaign.rounds[0]

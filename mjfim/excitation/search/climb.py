@@ -20,6 +20,7 @@ from mjfim.excitation.search.descent import Barrier, FreeMemory, Ground, Step
 from mjfim.excitation.search.inside import InsideSearch, with_corrected_end
 from mjfim.excitation.search.levels import DescentLevel
 from mjfim.excitation.task import DesignTask
+from mjfim.excitation.task_parts import Known
 from mjfim.experiment.schema import Experiment
 from mjfim.model.variants import ModelVariant
 from mjfim.parallel import (
@@ -239,11 +240,11 @@ def made_grounds(
     experiment: Experiment,
     variant: ModelVariant,
     combinations: Array | None,
-    added_information: Array | None,
+    added: Known | None,
     threads: int,
 ) -> Grounds:
     """Make the levels of a design in a worker."""
-    task = DesignTask.resolve(experiment, threads=threads, added_information=added_information)
+    task = DesignTask.resolve(experiment, threads=threads, added=added)
     return Grounds(task.with_variant(variant), combinations)
 
 

@@ -698,7 +698,7 @@ class Search:
                 for_workers(task.experiment, task.system.source),
                 task.system.variant,
                 self.stage.basis,
-                task.added_information,
+                task.added,
                 threads,
             )
             self._plans[threads] = SharedValue(uuid.uuid4().hex, plan)

@@ -7,7 +7,7 @@ are numbers of the model and of the measurement.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import field
+from dataclasses import field, replace
 from typing import Any
 
 import mujoco
@@ -38,10 +38,14 @@ LINEARISATION_SIZE = 1e-4
 # Smallest size of a term that simulations look for, relative to its natural size.
 SCREENED_SIZE = 1.0 / 27.0
 
-# Latencies of a control law that are candidates, with their names in words.
-LATENCIES = {
+# Numbers of a control law that are candidates, with their names in words.
+LAW_NUMBERS = {
+    "kp": "another gain of the driver of {}",
+    "kd": "damping by the driver of {}",
     "latency": "late commands of the driver of {}",
+    "time_constant": "filtered references of the driver of {}",
     "feedback_latency": "late feedback of the driver of {}",
+    "velocity_time_constant": "filtered velocities of the driver of {}",
 }
 
 # Smallest component of gravity, as a share of it, that does not count as zero.
@@ -123,7 +127,7 @@ def candidates_of(system: System, speeds: Array) -> tuple[list[Candidate], list[
         for target in parameter.targets
     }
     library, impossible = _library_terms(system, speeds, targets)
-    numbers = (*_joint_terms(system), *_latencies(system), *_gains(system), *_tilts(system))
+    numbers = (*_joint_terms(system), *_law_numbers(system), *_gains(system), *_tilts(system))
     further = (*_misalignments(system), *_output_errors(system))
     found = [
         candidate
@@ -202,13 +206,28 @@ def _period_of(system: System) -> float:
     return 1.0 / system.experiment.rate
 
 
-def _latencies(system: System) -> Iterator[Candidate]:
-    """Latencies of every control law."""
-    size = LINEARISATION_SIZE * _period_of(system)
-    for name, words in LATENCIES.items():
-        for law in () if system.laws is None else system.laws.laws:
-            number = _number(system, f"controller/{law.actuator}:{name}", size, positive=True)
-            yield _at_joint(words, law.actuator, law.joint, number)
+def _law_numbers(system: System) -> Iterator[Candidate]:
+    """Gains, latencies and filters of every control law."""
+    time = LINEARISATION_SIZE * _period_of(system)
+    for law in () if system.laws is None else system.laws.laws:
+        values = law.numbers(system.model)
+        follows = law.reference_differences or "reference_velocity" in law.columns
+        possible = dict.fromkeys(LAW_NUMBERS, True) | {
+            "kp": values["kp"] > 0.0,
+            # A gain that only brakes is viscous damping of the joint.
+            "kd": values["kp"] > 0.0 and follows,
+            "velocity_time_constant": values["kd"] > 0.0,
+        }
+        sizes = {"kp": LINEARISATION_SIZE * values["kp"], "kd": time * values["kp"]}
+        # A filter has no effect up to a part of the period of its law.
+        tick = law.tick * float(system.model.opt.timestep)
+        begins = {"time_constant": tick, "velocity_time_constant": tick}
+        for name, words in LAW_NUMBERS.items():
+            if possible[name]:
+                path, size = f"controller/{law.actuator}:{name}", sizes.get(name, time)
+                number = _number(system, path, size, positive=True)
+                number = replace(number, begin=max(number.begin, begins.get(name, 0.0)))
+                yield _at_joint(words, law.actuator, law.joint, number)
 
 
 def _gains(system: System) -> Iterator[Candidate]:
