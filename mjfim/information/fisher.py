@@ -130,7 +130,7 @@ class FisherInformation:
         measure_rate: f_m, rate of the measurements [Hz].
         scale: (p,) scales of the parameters [theta-unit].
         prior: (p, p) prior information [1 / (theta_i theta_j unit)].
-        criterion: "E", "A", "D" or "c".
+        criterion: A name of `CRITERIA`, or "c".
         weight: Q_p, factor of the criterion.
         interest: Indices of the t wanted parameters, None for all; the others are removed by the
             Schur complement.

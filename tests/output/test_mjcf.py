@@ -20,7 +20,7 @@ from mjfim.experiment.packing import with_model
 from mjfim.experiment.system import System
 from mjfim.files import write_json
 from mjfim.model.given import same_dynamics
-from mjfim.model.paths import KINDS, fields_of
+from mjfim.model.paths import KINDS, MODEL_ARRAYS, fields_of
 from mjfim.output.archive import summary_with_origin
 from mjfim.output.export.mjcf import write_identified
 from mjfim.records.estimate import Estimate
@@ -234,7 +234,7 @@ def assert_is_identified_model(path: Path, system: System, theta: Any) -> None:
         assert a.shape == b.shape, name
         size = PRECISE * np.abs(b).max(initial=0.0)
         assert_allclose(a, b, rtol=PRECISE, atol=size, err_msg=name)
-    for name in ("gravity", "wind", "density", "viscosity", "timestep"):
+    for name in (*MODEL_ARRAYS["option"], "timestep"):
         a, b = getattr(found.opt, name), getattr(wanted.opt, name)
         assert_allclose(a, b, rtol=1e-15, err_msg=name)
     mine, theirs = inertias(found), inertias(wanted)

@@ -231,17 +231,7 @@ def _axes_with_effect(model: mujoco.MjModel, body: int) -> tuple[int, ...]:
 
 # All kinds of terms, by the name that the experiment file gives them.
 KINDS: dict[str, type[Term]] = {
-    kind.kind: kind
-    for kind in (
-        friction.Stribeck,
-        friction.LuGre,
-        friction.AsymmetricFriction,
-        friction.LoadDependentFriction,
-        drives.ActuatorLag,
-        drives.BackEmf,
-        drives.JointElasticity,
-        drives.Backlash,
-        Tilt,
-        Payload,
-    )
+    each.kind: each
+    for each in [*vars(friction).values(), *vars(drives).values(), *globals().values()]
+    if isinstance(each, type) and issubclass(each, Term) and "kind" in vars(each)
 }

@@ -78,7 +78,7 @@ INERTIAL = {
 }
 
 # Fewest numbers of the attributes that MuJoCo takes as a whole only.
-LEAST = {"pos": 3, "axis": 3, "quat": 4, "diaginertia": 3, "gravity": 3, "wind": 3}
+LEAST = {"pos": 3, "axis": 3, "quat": 4, "diaginertia": 3}
 
 # Numbers that determine the force of an actuator. By element and attribute, where each number of
 # the attribute stands among them: array, column and sign. A <general> states the arrays.
@@ -172,14 +172,14 @@ class _Statement:
             self._set(element, attribute, before[attribute], after[attribute])
 
     def state_options(self) -> None:
-        """State the options that differ, where the text states them last."""
+        """State the options that differ, as whole vectors, where the text states them last."""
         for field in MODEL_ARRAYS["option"]:
             before, after = (np.atleast_1d(getattr(model.opt, field)) for model in self._models)
             if not nearly_equal(before, after).all():
                 self.is_changed = True
                 options = self._xml.sections("option") or [child(self._xml.root, "option")]
                 stating = [option for option in options if field in option.attrib]
-                self._set([*options, *stating][-1], field, before, after)
+                set_numbers([*options, *stating][-1], field, before, after, len(after))
 
     def _set(self, element: Any, attribute: str, before: Array, after: Array) -> None:
         """State numbers in the unit and the frame of an attribute."""
