@@ -22,7 +22,6 @@ from tests.fuzz.player import (
     NEAREST,
     ROUNDING,
     Excess,
-    Layout,
     play,
     read_reference,
 )
@@ -30,6 +29,7 @@ from tests.fuzz.problems import omissions
 from tests.fuzz.result_files import PIXEL, faults_in
 from tests.fuzz.workers import run_cases
 from tests.support.cli import write_experiment
+from tests.support.limits import full_rows
 
 # Time of each kind in these tests [s]; no case begins later.
 SECONDS = {
@@ -191,18 +191,7 @@ def excesses(
 ) -> Excess:
     """Play rows whose numbers are zero unless they are given."""
     model = mujoco.MjModel.from_xml_string(xml)
-    layout = Layout(model)
-    names = [name for part in layout.columns for name in part]
-    zero = dict.fromkeys([*names, *(f"ctrl:{name}" for name in layout.drives)], 0.0)
-    zero |= {name: 1.0 for name in names if name.endswith(".qw")}
-    for drive in layout.drives:
-        gains = [
-            f"gain:{drive}:q{kind}:{name}" for kind in ("pos", "vel") for name in layout.freedoms
-        ]
-        zero |= dict.fromkeys(gains, 0.0)
-    assert all(set(row) <= set(zero) for row in given)
-    rows = [{**zero, **row, "t": period * i} for i, row in enumerate(given)]
-    return play(model, rows, ranges, period, feedback)
+    return play(model, full_rows(model, given, period), ranges, period, feedback)
 
 
 @pytest.mark.parametrize(("xml", "rows", "feedback", "largest"), PLAYED)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,7 @@ from mjfim.excitation.limits.constraint_kinds import ConstraintValues
 from mjfim.excitation.limits.constraints import ConstraintSet, constraint_set_of
 from mjfim.excitation.search.interior_problem import InteriorProblem
 from mjfim.excitation.task import DesignTask
-from tests.fuzz.player import NEAREST, Layout, play
+from tests.fuzz.player import NEAREST, Layout, Row, play
 from tests.support.numerics import TILT, Array, cart_task, directional_check, make_task
 
 # An arm of two servos on a floating hull: the addresses of positions, velocities, joints and
@@ -179,6 +179,21 @@ def barrier_check(task: DesignTask, delta: float) -> float:
     gradient = expansion.gradient(np.zeros((task.samples, len(task.controls), task.space.nx)))
     ways = directions_of(task, 6) * np.abs(task.control - task.centre).max(axis=0)
     return slope_check(task, gradient, lambda ctrl: problem.point(ctrl).barrier, ways, 2e-5)
+
+
+def full_rows(model: Any, given: Sequence[dict[str, float]], period: float) -> list[Row]:
+    """Rows of a design.csv whose numbers are zero unless they are given."""
+    layout = Layout(model)
+    names = [name for part in layout.columns for name in part]
+    zero = dict.fromkeys([*names, *(f"ctrl:{name}" for name in layout.drives)], 0.0)
+    zero |= {name: 1.0 for name in names if name.endswith(".qw")}
+    for drive in layout.drives:
+        gains = [
+            f"gain:{drive}:q{kind}:{name}" for kind in ("pos", "vel") for name in layout.freedoms
+        ]
+        zero |= dict.fromkeys(gains, 0.0)
+    assert all(set(row) <= set(zero) for row in given)
+    return [{**zero, **row, "t": period * i} for i, row in enumerate(given)]
 
 
 def excess_of(task: DesignTask, ctrl: Array) -> dict[tuple[str, str], float]:
