@@ -137,6 +137,7 @@ def random_tables(rng: Rng, plant: Plant) -> Tables:
             "seconds": SECONDS,
             "starts": int(rng.choice([1, 1, 1, 2])),
         },
+        "rehearsal": {"robots": 4},
     }
 
     # With a playback rate, the limit of a control's rate holds from row to row.
