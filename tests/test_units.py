@@ -304,26 +304,3 @@ def assert_same(
         else:
             rtol = 1e-3 if key in rough else 1e-9
             assert_allclose(found[key], value, rtol=rtol, atol=1e-9, err_msg=key)
-
-
-def test_converged_designs_and_estimates_agree_in_decimal_units(
-    tmp_path, recording: Recording
-) -> None:
-    """Numbers are rounded differently there, so a descent takes other steps to one optimum."""
-    descent = {"max_iterations": 60, "coarse": 1}
-    original = stated(tmp_path / "original", descent=descent, **FITS["segments"])
-    own, other = (
-        rescale(original, units, tmp_path / "rescaled" / str(units.time))
-        for units in (Units(), Units(length=1e-3, mass=1e-6, time=1e-3))
-    )
-    expected, found = (in_units(each, design(each.experiment)) for each in (own, other))
-    assert found["status"] == expected["status"]
-    assert found["cost"] == pytest.approx(expected["cost"], rel=1e-5)
-    largest = np.abs(expected["control"]).max()
-    assert_allclose(found["control"], expected["control"], atol=0.01 * largest)
-
-    fitted, again = (fit_in_units(each, recording) for each in (own, other))
-    for key in ("theta", "std"):
-        assert_allclose(again[key], fitted[key], rtol=1e-6)
-    assert (again["misfit"], again["terms"]) == (fitted["misfit"], fitted["terms"])
-    assert_allclose(again["sigmas"], fitted["sigmas"], rtol=1e-3)

@@ -21,14 +21,7 @@ from mjfim.studies.first_experiment import (
     identifiable,
     propose_experiment,
 )
-from mjfim.studies.first_motion import (
-    RATE_RANGE,
-    _candidates,
-    _rate,
-    choose_start,
-    require_support,
-    time_scale,
-)
+from mjfim.studies.first_motion import choose_start, require_support
 from tests.support.cli import MODELS
 
 # Whole jobs: these tests run in `.ci/run` only.
@@ -184,6 +177,10 @@ def test_the_file_runs_as_it_stands_and_keeps_all_limits(name: str, tmp_path: Pa
     found_later = {"end_position", "end_velocity"} if proposal.flies else set()
     assert {kind for kind, margin in margins.items() if margin < 0.0} <= found_later
     assert {each.name for each in proposal.chosen} == set(experiment.parameters)
+    # The gains of the feedback read positions and velocities, which no sensor shows.
+    flight = {"imu_gyro", "qpos:base.pos", "qvel:base.rot"} if proposal.flies else set()
+    assert flight <= set(experiment.noise)
+    assert experiment.rehearsal.feedback is proposal.flies
 
     found = check(experiment.replace(rehearsal={"robots": 0}))
     assert not found.not_separable
@@ -479,13 +476,6 @@ def test_a_robot_that_flies_gets_a_box_speeds_a_tilt_a_floor_and_feedback(tmp_pa
     assert min(m for kind, m in margins.items() if not kind.startswith("end_")) >= 0.0
 
 
-def test_the_motion_of_a_flight_is_measured_also_where_there_are_sensors(tmp_path: Path) -> None:
-    """The gains of the feedback read positions and velocities, which no sensor shows."""
-    _, experiment = proposed(MODELS / "quadrotor.xml", tmp_path)
-    assert experiment.rehearsal.feedback
-    assert {"imu_gyro", "qpos:base.pos", "qvel:base.rot"} <= set(experiment.noise)
-
-
 def test_a_robot_without_weight_needs_no_floor_and_no_tilt(tmp_path: Path) -> None:
     _, experiment = proposed(written(tmp_path, FLYER.format(gravity=0)), tmp_path)
     assert "base" in experiment.limits.position
@@ -728,42 +718,6 @@ def test_controls_of_an_actuator_with_several_are_told_apart(tmp_path: Path) -> 
     assert len(start.control) == model.nu == 4
     proposal, _ = proposed(path, tmp_path)
     assert list(proposal.amplitudes) == ["turn[0]", "turn[1]", "turn[2]", "elbow"]
-
-
-def test_rates_are_near_the_wanted_ones_and_slow_drifts_do_not_take_hours() -> None:
-    for wanted, timestep in ((97.0, 0.002), (320.0, 0.002), (33.0, 0.005)):
-        model = mujoco.MjModel.from_xml_string(
-            f'<mujoco><option timestep="{timestep}" gravity="0 0 0"/><worldbody><body>'
-            '<joint type="slide" damping="1e-6"/><geom size="0.1" mass="1"/></body></worldbody>'
-            "</mujoco>"
-        )
-        assert RATE_RANGE**-1 <= _rate(timestep, wanted) / wanted <= RATE_RANGE
-        times = time_scale(model, mujoco.MjData(model))
-        assert times.horizon <= 10.0 * 1000 * timestep
-
-
-def test_the_driven_joints_of_a_robot_on_the_floor_may_stay_where_they_are() -> None:
-    # The strong motors hold the raised legs, on which the body comes to stand.
-    model = mujoco.MjModel.from_xml_string("""
-    <mujoco>
-      <worldbody><geom type="plane" size="5 5 1"/>
-        <body name="b" pos="0 0 1"><freejoint/><geom type="box" size="0.2 0.2 0.05" mass="1"/>
-        <body pos="0.2 0 0"><joint name="l" axis="0 1 0" range="-90 90" limited="true"/>
-        <geom type="capsule" fromto="0 0 0 0.1 0 -0.2" size="0.05" mass="0.2"/></body>
-        <body pos="-0.2 0.1 0"><joint name="m" axis="0 1 0" range="-90 90" limited="true"/>
-        <geom type="capsule" fromto="0 0 0 -0.1 0 -0.2" size="0.05" mass="0.2"/></body>
-        <body pos="-0.2 -0.1 0"><joint name="n" axis="0 1 0" range="-90 90" limited="true"/>
-        <geom type="capsule" fromto="0 0 0 -0.1 0 -0.2" size="0.05" mass="0.2"/></body></body>
-      </worldbody>
-      <actuator><motor joint="l" ctrlrange="-9 9"/><motor joint="m" ctrlrange="-9 9"/>
-        <motor joint="n" ctrlrange="-9 9"/></actuator>
-    </mujoco>
-    """)
-    standing = next(start for start in _candidates(model) if "locked" in start.reason)
-    assert np.abs(standing.qpos[7:]).max() < 1e-9
-    assert 0.2 < standing.qpos[2] < 0.3
-    reference = next(_candidates(model))
-    assert choose_start(model).drift <= standing.drift < 0.1 * reference.drift
 
 
 def test_the_horizon_ends_where_a_small_disturbance_has_grown_too_much(tmp_path: Path) -> None:

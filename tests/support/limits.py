@@ -207,14 +207,9 @@ def excess_of(task: DesignTask, ctrl: Array) -> dict[tuple[str, str], float]:
     layout = Layout(model)
     columns = itertools.chain.from_iterable(layout.columns)
     start = dict(zip(columns, task.plant.nominal_initial_state.tolist(), strict=True))
-    rows = [
-        {
-            **start,
-            "t": k * task.dt,
-            **{f"ctrl:{n}": u for n, u in zip(task.controls, now, strict=True)},
-        }
-        for k, now in enumerate([*ctrl.tolist(), ctrl[-1].tolist()])
-    ]
+    names = [f"ctrl:{name}" for name in task.controls]
+    held = [*ctrl.tolist(), ctrl[-1].tolist()]
+    given = [start | dict(zip(names, now, strict=True)) for now in held]
     ranges = {
         (limit.kind, limit.name): (-limit.upper if limit.is_magnitude else limit.lower, limit.upper)
         for limit in task.limits
@@ -226,7 +221,7 @@ def excess_of(task: DesignTask, ctrl: Array) -> dict[tuple[str, str], float]:
         for name in layout.freedoms:
             ranges["end_position", name] = (-boundary.position, boundary.position)
             ranges["end_velocity", name] = (-boundary.velocity, boundary.velocity)
-    return play(model, rows, ranges, task.dt).found
+    return play(model, full_rows(model, given, task.dt), ranges, task.dt).found
 
 
 # Limits that the cart-pendulum meets quickly.

@@ -11,7 +11,7 @@ from tests.support.paths import MODELS
 QUICKER = {
     "--seconds 10 ": "--seconds 2 ",
     "seconds=4.0": "seconds=1.0",
-    "seconds=10": "seconds=1",
+    "(experiment, seconds=10)": '(experiment.replace(rehearsal={"robots": 4}), seconds=1)',
     "--samples 50": "--samples 5",
     "--trials 200": "--trials 20",
     "trials=60": "trials=10",
