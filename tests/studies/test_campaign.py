@@ -178,7 +178,8 @@ def earlier(campaign: Campaign) -> EarlierRound:
 def after_two(campaign: Campaign, second: Recording) -> Campaign:
     """The campaign after its first round and a second one with this recording."""
     done = [earlier(campaign), EarlierRound(recordings=(second,))]
-    return mjfim.run_campaign(STUDY.replace(fit={"bootstrap": 0}), NEVER, rounds=2, done=done)
+    fit = {"segments": "whole", "bootstrap": 0}
+    return mjfim.run_campaign(STUDY.replace(fit=fit), NEVER, rounds=2, done=done)
 
 
 def test_a_round_without_progress_is_named(campaign: Campaign) -> None:

@@ -68,6 +68,7 @@ def experiment(home: Path, **load: float) -> mjfim.Experiment:
             "hand_mass": {"target": "body/hand:mass", "true": 0.31},
         },
         "noise": {"qpos:pitch": 0.003, "qpos:roll": 0.003},
+        "fit": {"segments": "whole"},
         "directory": home,
         "source": "arm.toml",
     }
