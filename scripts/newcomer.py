@@ -18,7 +18,7 @@ import subprocess
 import sys
 import time
 import tomllib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -33,6 +33,8 @@ from mjfim.files import read_json
 from mjfim.model.parameter_writer import ParameterWriter
 from scripts.benchmarks.child import ROOT, options_of
 from scripts.verbs import call_verb
+from tests.fuzz.player import ROUNDING_WITH_FEEDBACK as ROUNDING
+from tests.fuzz.player import Layout, Ranges, Row, play, read_rows, stated_ranges
 
 # Largest difference between the parameters of the simulated robot and those of the model, over
 # their sizes.
@@ -55,8 +57,8 @@ AGREEMENT = 0.3
 # Longest time of one verb; none should come near to it [s].
 PATIENCE = 600.0
 
-# Excess beyond a limit that rounding explains, as a fraction of half of the range.
-ROUNDING = 1e-6
+# Kinds of limits that MuJoCo keeps by clamps.
+FORCES = ("force", "joint_force", "tendon_force")
 
 # Files in the folder of a model.
 EXPERIMENT, ROBOT, LOG = "first.toml", "robot.toml", "log.csv"
@@ -237,24 +239,23 @@ def _judge_design(found: Walk, folder: Path, system: System) -> None:
 
     stated = tomllib.loads((folder / EXPERIMENT).read_text(encoding="utf-8"))
     model = mujoco.MjModel.from_xml_path(str(folder / stated["model"]))
-    with np.load(folder / "design" / "design.npz") as arrays:
-        names = ("t", "qpos", "qvel", "act", "ctrl", "gain")
-        trajectory = {name: arrays[name] for name in names}
-    found.violations = violations(model, trajectory, stated.get("limits", {}))
+    rows, ranges = read_rows(folder / "design" / "design.csv"), ranges_of(model, stated["limits"])
+    found.violations = violations(model, rows, ranges)
 
     rehearsal = design["rehearsal"]
     if rehearsal is None:
         return
     found.safe = bool(rehearsal["safe"])
     found.kept = rehearsal["all_limits_kept"] / max(rehearsal["robots"], 1)
+    # A robot that reaches a clamp leaves no limit, and the rehearsal counts it apart.
+    ranges = {limit: ends for limit, ends in ranges.items() if limit[0] not in (*FORCES, "control")}
     broken = 0
-    play = {"each_step": False, "feedback": rehearsal["feedback"]}
     rng = np.random.default_rng(37)
     for _ in range(ROBOTS):
         robot = system.model_at(_physical(system, WRONG, rng))
-        left = violations(robot, trajectory, stated.get("limits", {}), **play)
-        # A robot that reaches a clamp leaves no limit, and the rehearsal counts it apart.
-        broken += any(not each.startswith("force") for each in left)
+        period = rows[1]["t"] - rows[0]["t"]
+        left = play(robot, rows, ranges, period, rehearsal["feedback"])
+        broken += bool(left.sentences(ROUNDING))
     found.kept_in_mujoco = 1.0 - broken / ROBOTS
 
 
@@ -288,147 +289,43 @@ def _judge_deviations(found: Walk, experiment: mjfim.Experiment, design: mjfim.D
     found.agree = sum(abs(ratio - 1.0) < AGREEMENT for ratio in ratios)
 
 
-def violations(
-    model: Any,
-    trajectory: Mapping[str, np.ndarray],
-    stated: Mapping[str, Any],
-    *,
-    each_step: bool = True,
-    feedback: bool = False,
-) -> list[str]:
+def violations(model: Any, rows: list[Row], ranges: Ranges) -> list[str]:
     """Play a design in plain MuJoCo, and describe each range that it leaves.
 
-    Forces are those that the actuators ask for: a copy of the model without the clamps of forces
-    shows them in the states of the untouched model.
+    Forces are those that the actuators ask for. A model without the clamps of forces shows them,
+    and moves as the untouched one until a clamp acts.
 
     Args:
         model: The untouched model (`mujoco.MjModel`).
-        trajectory: t, qpos, qvel, act, ctrl and, for feedback, gain of design.npz.
-        stated: Table `limits` of the experiment file: ranges of controls and velocities by name.
-        each_step: Whether to look at every engine step, and not only whenever a control begins.
-        feedback: Whether the gains pull the robot to the designed motion.
-
-    Returns:
-        One sentence for each range.
+        rows: Rows of design.csv.
+        ranges: Range by kind and name of every limit.
     """
     unclamped = copy.copy(model)
     unclamped.actuator_forcelimited[:] = 0
     unclamped.jnt_actfrclimited[:] = 0
     unclamped.tendon_actfrclimited[:] = 0
-    data, shown = mujoco.MjData(model), mujoco.MjData(unclamped)
-    data.qpos[:], data.qvel[:], data.act[:] = (
-        trajectory[name][0] for name in ("qpos", "qvel", "act")
-    )
-    times, worst = trajectory["t"], dict[str, tuple[float, float]]()
-
-    def look() -> None:
-        """Compare the present state with all limits."""
-        shown.qpos[:], shown.qvel[:], shown.act[:] = data.qpos, data.qvel, data.act
-        shown.ctrl[:] = data.ctrl
-        mujoco.mj_forward(unclamped, shown)
-        for name, value, ends in _quantities(model, data, shown, stated):
-            if ends is None:
-                continue
-            least, most = ends
-            excess = float(max(least - value, value - most) / (0.5 * (most - least)))
-            if excess > worst.get(name, (ROUNDING, 0.0))[0] or np.isnan(excess):
-                worst[name] = (excess, float(data.time))
-
-    low, high = np.where(
-        model.actuator_ctrllimited, model.actuator_ctrlrange.T, [[-np.inf], [np.inf]]
-    )
-    ahead = np.zeros(model.nv)
-    for k, ctrl in enumerate(trajectory["ctrl"]):
-        data.ctrl[:] = ctrl
-        if feedback:
-            planned = {name: trajectory[name][k] for name in ("qpos", "qvel", "act")}
-            mujoco.mj_differentiatePos(model, ahead, 1.0, data.qpos, planned["qpos"])
-            behind = [ahead, planned["qvel"] - data.qvel, planned["act"] - data.act]
-            data.ctrl[:] = np.clip(ctrl + trajectory["gain"][k] @ np.concatenate(behind), low, high)
-        steps = round((times[k + 1] - times[k]) / model.opt.timestep)
-        look()
-        for _ in range(steps):
-            mujoco.mj_step(model, data)
-            if each_step:
-                look()
-    look()
-    return [
-        f"{name} by {100.0 * excess:.3g} % of half its range at {moment:.3g} s"
-        for name, (excess, moment) in worst.items()
-    ]
+    forces = {limit: ends for limit, ends in ranges.items() if limit[0] in FORCES}
+    period = rows[1]["t"] - rows[0]["t"]
+    played = play(model, rows, ranges, period), play(unclamped, rows, forces, period)
+    return [text for each in played for text in each.sentences(ROUNDING)]
 
 
-def _quantities(
-    model: Any, data: Any, shown: Any, stated: Mapping[str, Any]
-) -> Iterator[tuple[str, float, Any]]:
-    """Name, value and range of what may be limited, in the present state of a simulation.
-
-    Args:
-        model: The model.
-        data: The simulation, with positions, velocities and controls.
-        shown: The same without the clamps of forces, with forces and lengths.
-        stated: Table `limits` of the experiment file.
-
-    Yields:
-        The range is None where there is no limit.
-    """
-
-    def bound(kind: str, name: str, default: Any = None) -> Any:
-        """The stated range of a kind, which may be that of all names or that of the magnitude."""
-        found = stated.get(kind, {})
-        value = found.get(name) if isinstance(found, dict) else found
-        if value is None:
-            return default
-        return value if isinstance(value, list) else (-value, value)
-
-    for i in range(model.njnt):
-        name, kind = model.joint(i).name or f"joint{i}", mujoco.mjtJoint(model.jnt_type[i])
-        q, v = int(model.jnt_qposadr[i]), int(model.jnt_dofadr[i])
-        range_ = model.jnt_range[i] if model.jnt_limited[i] else None
-        if kind == mujoco.mjtJoint.mjJNT_BALL:
-            w, *xyz = data.qpos[q : q + 4]
-            angle = 2.0 * np.arctan2(np.linalg.norm(xyz), abs(w))
-            yield f"angle of {name}", angle, None if range_ is None else (-range_[1], range_[1])
-        elif kind == mujoco.mjtJoint.mjJNT_FREE:
-            boxes = bound("position", name, ())
-            for axis, position, ends in zip("xyz", data.qpos[q : q + 3], boxes, strict=False):
-                yield f"{axis} of {name}", position, ends
-
-            # The angle between the upward axes of the body, now and in the reference position.
-            turned, upright = np.zeros((2, 3))
-            mujoco.mju_rotVecQuat(turned, (0.0, 0.0, 1.0), data.qpos[q + 3 : q + 7])
-            mujoco.mju_rotVecQuat(upright, (0.0, 0.0, 1.0), model.qpos0[q + 3 : q + 7])
-            for each, value in (
-                ("velocity", np.linalg.norm(data.qvel[v : v + 3])),
-                ("angular_velocity", np.linalg.norm(data.qvel[v + 3 : v + 6])),
-                ("tilt", np.arccos(np.clip(turned @ upright, -1.0, 1.0))),
-            ):
-                yield f"{each} of {name}", float(value), bound(each, name)
-        else:
-            yield f"position of {name}", data.qpos[q], bound("position", name, range_)
-            clamp = model.jnt_actfrcrange[i] if model.jnt_actfrclimited[i] else None
-            yield f"force at {name}", shown.qfrc_actuator[v], clamp
-            yield f"velocity of {name}", data.qvel[v], bound("velocity", name)
-
-    on_tendon = model.actuator_trntype == int(mujoco.mjtTrn.mjTRN_TENDON)
-    for i in range(model.ntendon):
-        name = model.tendon(i).name or str(i)
-        if model.tendon_limited[i]:
-            ends = bound("tendon_length", name, model.tendon_range[i])
-            yield f"length of {name}", shown.ten_length[i], ends
-        if model.tendon_actfrclimited[i]:
-            outputs = model.actuator_outadr[on_tendon & (model.actuator_trnid[:, 0] == i)]
-            force = shown.actuator_force[outputs] @ model.actuator_gear[outputs, 0]
-            yield f"force on {name}", force, model.tendon_actfrcrange[i]
-
-    for i in range(model.nactuator):
-        name = model.actuator(i).name or str(i)
-        control, output = int(model.actuator_ctrladr[i]), int(model.actuator_outadr[i])
-        if model.actuator_forcelimited[i] and int(model.actuator_outnum[i]) == 1:
-            yield f"force of {name}", shown.actuator_force[output], model.actuator_forcerange[i]
-        if model.actuator_ctrllimited[control]:
-            yield f"control of {name}", data.ctrl[control], model.actuator_ctrlrange[control]
-        yield f"control of {name}", data.ctrl[control], bound("control", name)
+def ranges_of(model: Any, stated: Mapping[str, Any]) -> Ranges:
+    """Range of every limit by kind and name: that of the table `limits`, else that of the MJCF."""
+    layout = Layout(model)
+    ranges = stated_ranges(stated, layout.joints)
+    for kind, names, field_name in (
+        ("position", layout.joints, "jnt_"),
+        ("joint_force", layout.joints, "jnt_actfrc"),
+        ("tendon_length", layout.tendons, "tendon_"),
+        ("tendon_force", layout.tendons, "tendon_actfrc"),
+        ("control", layout.drives, "actuator_ctrl"),
+        ("force", layout.actuators, "actuator_force"),
+    ):
+        for i in np.flatnonzero(getattr(model, f"{field_name}limited")):
+            low, high = getattr(model, f"{field_name}range")[i].tolist()
+            ranges.setdefault((kind, names[i]), (low, high))
+    return ranges
 
 
 def main() -> int:

@@ -83,8 +83,9 @@ def test_streams_that_cannot_be_used(content: list[str], said: str, folder: Path
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-@pytest.mark.parametrize(("wanted", "code"), [(0.5, 0), (1e-3, 1)])
+@pytest.mark.parametrize(
+    ("number", "wanted", "code"), [(signal.SIGINT, 0.5, 0), (signal.SIGTERM, 1e-3, 1)]
+)
 def test_a_signal_ends_the_stream(
     number: signal.Signals, wanted: float, code: int, lines: list[str], here: Path
 ) -> None:

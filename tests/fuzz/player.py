@@ -1,4 +1,4 @@
-"""Play design.csv in plain MuJoCo, and compare every engine step with the limits.
+"""The judge of limits: it plays design.csv in plain MuJoCo, and compares every engine step.
 
 Nothing of the package is used here: the judge of a design must not share its mistakes.
 
@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import copy
 import csv
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
@@ -30,6 +30,12 @@ Pairs = tuple[tuple[str, str], ...]
 ROUNDING = 1e-9
 ROUNDING_WITH_FEEDBACK = 1e-6
 
+
+# Kinds that are compared at the states before and after each engine step, too.
+KINDS_OF_STATES = {"force", "joint_force", "tendon_force", "tendon_length"}
+
+# Keys of a table `limits` that are no ranges of named quantities.
+NO_RANGES = {"bandwidth", "clearance", "enforce", "floor", "ignored", "reserve"}
 
 # Name of the clearance, of which there is only one: its range is from it to twice of it.
 NEAREST = "nearest pair"
@@ -79,6 +85,26 @@ class Excess:
         ]
 
 
+def stated_ranges(limits: Mapping[str, Any], joints: Sequence[str]) -> Ranges:
+    """Range by kind and name of the limits that a table `limits` states.
+
+    One number holds for all joints. The three ranges of a free joint have the names of its
+    coordinates.
+    """
+    ranges: Ranges = {}
+    for kind, value in limits.items():
+        if kind in NO_RANGES:
+            continue
+        by_name = value if isinstance(value, dict) else dict.fromkeys(joints, value)
+        for name, bounds in by_name.items():
+            is_box = np.ndim(bounds) == 2
+            parts = zip(PLACE, bounds, strict=True) if is_box else [("", bounds)]
+            for part, ends in parts:
+                low, high = (-ends, ends) if np.isscalar(ends) else ends
+                ranges[kind, f"{name}{part}"] = (low, high)
+    return ranges
+
+
 def read_rows(path: Path) -> list[Row]:
     """Read the rows of design.csv or reference.csv; an empty field is NaN."""
     with path.open(newline="", encoding="utf-8") as stream:
@@ -117,9 +143,12 @@ def play(
     start = layout.planned(rows[0])
     data.qpos[:], data.qvel[:], data.act[:] = start
     before: np.ndarray | None = None
+    sees_states = not KINDS_OF_STATES.isdisjoint(kind for kind, _ in ranges)
 
     def look_at_state() -> None:
         """Compare the forces at the present state with the limits."""
+        if not sees_states:
+            return
         still.qpos[:], still.qvel[:], still.act[:] = data.qpos, data.qvel, data.act
         still.ctrl[:] = data.ctrl
         mujoco.mj_forward(model, still)
@@ -170,8 +199,13 @@ def read_reference(rows: list[Row], ranges: Ranges) -> Excess:
 class Layout:
     """Names of the columns of design.csv, and where MuJoCo keeps them.
 
+    An element without a name is called by its number.
+
     Attributes:
-        drives: Names of the controls.
+        joints: Names of the joints.
+        tendons: Names of the tendons.
+        actuators: Names of the actuators.
+        drives: Names of the controls, of which an actuator may have several.
         freedoms: Names of the degrees of freedom.
         columns: Columns of qpos, of qvel and of act.
     """
@@ -179,20 +213,35 @@ class Layout:
     def __init__(self, model: mujoco.MjModel) -> None:
         """The layout of a model."""
         self.model = model
-        self.drives = [model.actuator(i).name for i in range(model.nu)]
-        self.tendons = [model.tendon(i).name for i in range(model.ntendon)]
-        joints = [model.joint(i) for i in range(model.njnt)]
-        self.turning = [joint for joint in joints if int(joint.type[0]) in PARTS]
-        self.scalar = [joint for joint in joints if int(joint.type[0]) not in PARTS]
+        self.actuators, self.tendons, self.joints = (
+            [element(i).name or str(i) for i in range(count)]
+            for element, count in (
+                (model.actuator, model.nactuator),
+                (model.tendon, model.ntendon),
+                (model.joint, model.njnt),
+            )
+        )
+        self.drives = [
+            f"{name}[{k}]" if count > 1 else name
+            for name, count in zip(self.actuators, model.actuator_ctrlnum, strict=True)
+            for k in range(count)
+        ]
+        joints = [(name, model.joint(i)) for i, name in enumerate(self.joints)]
+        self.turning = [each for each in joints if int(each[1].type[0]) in PARTS]
+        self.scalar = [each for each in joints if int(each[1].type[0]) not in PARTS]
         positions, self.freedoms = [], []
-        for joint in joints:
+        for name, joint in joints:
             position, velocity = PARTS.get(int(joint.type[0]), (("",), ("",)))
-            positions += [f"qpos:{joint.name}{part}" for part in position]
-            self.freedoms += [f"{joint.name}{part}" for part in velocity]
+            positions += [f"qpos:{name}{part}" for part in position]
+            self.freedoms += [f"{name}{part}" for part in velocity]
         self.columns = (
             positions,
             [f"qvel:{name}" for name in self.freedoms],
-            [f"act:{name}" for name in self.drives if model.actuator(name).actadr[0] >= 0],
+            [
+                f"act:{name}"
+                for name, first in zip(self.actuators, model.actuator_actadr, strict=True)
+                if first >= 0
+            ],
         )
 
         # The reference position, and the direction that is upward, against gravity.
@@ -221,33 +270,37 @@ class Layout:
     def see_forces(self, data: mujoco.MjData, excess: Excess) -> None:
         """Compare the forces and the lengths of tendons with their limits."""
         pulled = np.zeros(self.model.ntendon)
-        for i in np.flatnonzero(self.model.actuator_trntype == int(mujoco.mjtTrn.mjTRN_TENDON)):
-            pulled[self.model.actuator_trnid[i, 0]] += data.actuator_force[i]
-        excess.see_all("force", self.drives, data.actuator_force)
-        for joint in self.scalar:
-            excess.see("joint_force", joint.name, data.qfrc_actuator[joint.dofadr[0]])
+        for i, name in enumerate(self.actuators):
+            if self.model.actuator_outnum[i] != 1:
+                continue
+            force = data.actuator_force[self.model.actuator_outadr[i]]
+            excess.see("force", name, force)
+            if self.model.actuator_trntype[i] == int(mujoco.mjtTrn.mjTRN_TENDON):
+                pulled[self.model.actuator_trnid[i, 0]] += force
+        for name, joint in self.scalar:
+            excess.see("joint_force", name, data.qfrc_actuator[joint.dofadr[0]])
         excess.see_all("tendon_force", self.tendons, pulled)
         excess.see_all("tendon_length", self.tendons, data.ten_length)
 
     def see_motion(self, data: mujoco.MjData, acceleration: np.ndarray, excess: Excess) -> None:
         """Compare the motion of all joints with its limits."""
-        for joint in self.scalar:
+        for name, joint in self.scalar:
             q, v = int(joint.qposadr[0]), int(joint.dofadr[0])
-            excess.see("position", joint.name, data.qpos[q])
-            excess.see("velocity", joint.name, data.qvel[v])
-            excess.see("acceleration", joint.name, acceleration[v])
+            excess.see("position", name, data.qpos[q])
+            excess.see("velocity", name, data.qvel[v])
+            excess.see("acceleration", name, acceleration[v])
         if self.turning:
             mujoco.mj_kinematics(self.model, data)
-        for joint in self.turning:
-            self._see_turning(joint, data, acceleration, excess)
+        for name, joint in self.turning:
+            self._see_turning(name, joint, data, acceleration, excess)
 
     def _see_turning(
-        self, joint: Any, data: mujoco.MjData, acceleration: np.ndarray, excess: Excess
+        self, name: str, joint: Any, data: mujoco.MjData, acceleration: np.ndarray, excess: Excess
     ) -> None:
         """Compare the motion of a ball joint or a free joint with its limits, which for speeds and
         angles are symmetric about 0.
         """
-        name, q, v = joint.name, int(joint.qposadr[0]), int(joint.dofadr[0])
+        q, v = int(joint.qposadr[0]), int(joint.dofadr[0])
         moved, changed = data.qvel[v : v + 3], acceleration[v : v + 3]
         excess.see("velocity", name, np.linalg.norm(moved))
         excess.see("acceleration", name, np.linalg.norm(changed))

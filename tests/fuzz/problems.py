@@ -26,6 +26,7 @@ from tests.fuzz.player import (
     play,
     read_reference,
     read_rows,
+    stated_ranges,
 )
 
 # Time of one design [s]; the iterations end most of them before.
@@ -95,21 +96,10 @@ def omissions(plant: Plant, warnings: tuple[str, ...]) -> list[str]:
 
 def all_ranges(plant: Plant, tables: Tables) -> Ranges:
     """Range of every limit by kind and name: where MJCF and file state one, both hold."""
-    joints = [joint.name for joint in plant.joints]
-    turning = [joint.name for joint in plant.joints if not joint.is_scalar]
-    owners = dict.fromkeys(("position", "velocity", "acceleration"), joints)
-    owners |= dict.fromkeys(("tilt", "angular_velocity"), turning)
-
     ranges, limits = dict(plant.ranges), tables["limits"]
-    for kind, value in limits.items():
-        if kind in ("bandwidth", "clearance", "ignored"):
-            continue
-        # One number holds for all joints to which such a limit applies.
-        stated = value if isinstance(value, dict) else dict.fromkeys(owners[kind], value)
-        for name, bounds in by_coordinate(stated).items():
-            low, high = bounds if isinstance(bounds, tuple) else (-bounds, bounds)
-            lower, upper = ranges.get((kind, name), (-np.inf, np.inf))
-            ranges[kind, name] = (max(low, lower), min(high, upper))
+    for limit, (low, high) in stated_ranges(limits, [each.name for each in plant.joints]).items():
+        lower, upper = ranges.get(limit, (-np.inf, np.inf))
+        ranges[limit] = (max(low, lower), min(high, upper))
 
     if "clearance" in limits:
         least = limits["clearance"]
@@ -123,16 +113,6 @@ def all_ranges(plant: Plant, tables: Tables) -> Ranges:
                     bound = boundary[kind]
                     ranges[f"end_{kind}", f"{joint.name}{part}"] = (-bound, bound)
     return ranges
-
-
-def by_coordinate(stated: Tables) -> Tables:
-    """A table in which the three ranges of a free joint have the names of its coordinates."""
-    table = {}
-    for name, value in stated.items():
-        is_box = isinstance(value, tuple) and len(value) == len(PLACE)
-        parts = zip(PLACE, value, strict=True) if is_box else [("", value)]
-        table.update({f"{name}{part}": each for part, each in parts})
-    return table
 
 
 def random_tables(rng: Rng, plant: Plant) -> Tables:
@@ -157,6 +137,7 @@ def random_tables(rng: Rng, plant: Plant) -> Tables:
             "seconds": SECONDS,
             "starts": int(rng.choice([1, 1, 1, 2])),
         },
+        "rehearsal": {"robots": 4},
     }
 
     # With a playback rate, the limit of a control's rate holds from row to row.

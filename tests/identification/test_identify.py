@@ -36,9 +36,7 @@ from tests.support.terms import recorded
 @pytest.fixture(scope="module")
 def task() -> DesignTask:
     """The cart-pendulum for two seconds, with a design of few iterations."""
-    return DesignTask.resolve(
-        cart_pendulum(horizon=2.0, descent={"max_iterations": 10}, rehearsal={"robots": 1})
-    )
+    return DesignTask.resolve(cart_pendulum(horizon=2.0, descent={"max_iterations": 10}))
 
 
 @pytest.fixture(scope="module")

@@ -57,16 +57,16 @@ def test_a_small_term_that_matters_is_found_in_much_data() -> None:
 
     force = 0.01
     large = tilt(tested(force, 0))
-    found = [tested(6.0 * force / large, seed) for seed in range(2)]
-    assert all(tilt(tests) > 0.0 for tests in found)
-    assert max(term.share for tests in found for term in tests.terms) < 2.2e-3
+    found = tested(6.0 * force / large, 1)
+    assert tilt(found) > 0.0
+    assert max(term.share for term in found.terms) < 2.2e-3
     assert tested(0.0, 0).terms == ()
-    assert "could move" in found[0].data.unseen_sentence
+    assert "could move" in found.data.unseen_sentence
 
 
 @pytest.mark.slow
 def test_a_bias_and_a_delay_are_found() -> None:
-    experiment = stated(horizon=2.0)
+    experiment = stated(horizon=2.0).replace(fit={"segments": "whole"})
     (clean,) = logs_of(experiment, 1)
     biased = mjfim.identify(experiment, [replace(clean, y=clean.y + 0.03 * np.eye(4)[3])])
     assert biased.missing_terms[0].path == "output/qvel:hinge:bias"

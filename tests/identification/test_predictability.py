@@ -47,7 +47,7 @@ def test_a_chaotic_motion_is_fitted_with_the_recommended_segments(tmp_path: Path
     recording = mjfim.simulate(experiment, control, seed=1, threads=1)
 
     # The length of the segments that a fit chooses would be short enough, too.
-    whole = experiment.replace(fit={"segments": "whole"})
+    whole = experiment.replace(fit={"segments": "whole", "max_iterations": 8})
     poor = mjfim.identify(whole, [recording], threads=1)
     assert poor.misfit
     advice = re.search(r"unstable or chaotic.*State fit.segments = (\S+) in", poor.warnings[0])

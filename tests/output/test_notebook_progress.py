@@ -49,7 +49,7 @@ def places(monkeypatch: pytest.MonkeyPatch) -> list[Shown]:
 @pytest.fixture(scope="module")
 def experiment() -> mjfim.Experiment:
     """The cart-pendulum for 0.4 s."""
-    return cart_pendulum(horizon=0.4, descent={"max_iterations": 2}, rehearsal={"robots": 2})
+    return cart_pendulum(horizon=0.4, descent={"max_iterations": 2})
 
 
 def repeat(e: mjfim.Experiment, **options: Any) -> object:

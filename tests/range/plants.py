@@ -73,6 +73,7 @@ def _study(
         "initial": {"control": control},
         "cost": {"criterion": "A", "control": 1e-3 / setting.mass**2, "linearize_at": "true"},
         "descent": {"max_iterations": 3, "seconds": 60.0},
+        "rehearsal": {"robots": 0},
     }
     return xml, {**content, **tables}
 

@@ -37,7 +37,15 @@ from mjfim.records.trajectory import Recording
 from mjfim.studies import campaign as campaign_module
 from mjfim.studies.campaign import restate_experiment
 from tests.support.cart_pendulum import cart_pendulum
-from tests.support.cli import PROCESS, misused, names, read, run, write_wrong_guess
+from tests.support.cli import (
+    PROCESS,
+    misused,
+    names,
+    read,
+    run,
+    write_empty_figures,
+    write_wrong_guess,
+)
 from tests.support.made_records import bare_estimate
 from tests.support.numerics import cart_task
 from tests.support.paths import MODELS
@@ -177,7 +185,8 @@ def earlier(campaign: Campaign) -> RecordedRound:
 def after_two(campaign: Campaign, second: Recording) -> Campaign:
     """The campaign after its first round and a second one with this recording."""
     done = [earlier(campaign), (None, (second,))]
-    return mjfim.run_campaign(STUDY.replace(fit={"bootstrap": 0}), NEVER, rounds=2, done=done)
+    fit = {"segments": "whole", "bootstrap": 0}
+    return mjfim.run_campaign(STUDY.replace(fit=fit), NEVER, rounds=2, done=done)
 
 
 def test_a_round_without_progress_is_named(campaign: Campaign) -> None:
@@ -277,7 +286,9 @@ WANTED = ("--wanted", 0.0055)
 def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of a campaign by the command line, beside the file of its study."""
     home = tmp_path_factory.mktemp("whole")
-    result = run("campaign", write_study(home), *WANTED, "--seed", 5, "-o", home / "whole")
+    with pytest.MonkeyPatch.context() as patch:
+        write_empty_figures(patch)
+        result = run("campaign", write_study(home), *WANTED, "--seed", 5, "-o", home / "whole")
     assert result.exit_code == 0, result.stderr
     return home / "whole"
 

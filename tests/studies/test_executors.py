@@ -71,7 +71,7 @@ def limited_task(folder: Path, **descent: float) -> DesignTask:
 
 def small_task(folder: Path) -> DesignTask:
     """The task of a design from several starts."""
-    return limited_task(folder, starts=3, max_iterations=12)
+    return limited_task(folder, starts=3, max_iterations=5)
 
 
 @pytest.fixture(scope="module")
@@ -116,14 +116,14 @@ def test_all_executors_behave_alike(
         assert np.array_equal(found.trajectory.ctrl, serial.trajectory.ctrl)
 
         # A request to stop ends the design soon with its best result so far.
-        long = limited_task(tmp_path, starts=40, max_iterations=10_000)
+        long = limited_task(tmp_path, starts=6, max_iterations=10_000)
         stop = StopToken()
         asked = []
 
         def ask(event: DesignEvent) -> None:
             """Ask for the end after some iterates."""
             asked.append(time.monotonic())
-            if len(asked) >= 12:
+            if len(asked) >= 4:
                 stop.request()
 
         stopped = design_task(long, callback=ask, executor=workers, budget=Budget(stop=stop))
@@ -132,7 +132,7 @@ def test_all_executors_behave_alike(
         assert stopped.final.cost < stopped.initial.cost
 
         # The workers can be used again, and the time ends a design.
-        short = limited_task(tmp_path, starts=40, seconds=1.0)
+        short = limited_task(tmp_path, starts=6, seconds=0.4)
         ended = design_task(short, executor=workers)
         assert ended.status is not Status.INTERRUPTED
         assert ended.final.cost <= ended.initial.cost

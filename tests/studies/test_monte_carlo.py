@@ -22,7 +22,7 @@ from tests.support.cart_pendulum import cart_pendulum
 PAPER_BOUND = np.array([1.04e-3, 2.26e-3, 4.57e-2])
 
 
-EXPERIMENT = cart_pendulum(rehearsal={"robots": 4})
+EXPERIMENT = cart_pendulum()
 
 
 @pytest.fixture(scope="module")

@@ -60,7 +60,7 @@ def experiment(home: Path, **load: float) -> mjfim.Experiment:
     tables = {
         "model": "arm.xml",
         "rate": 50.0,
-        "horizon": 4.0,
+        "horizon": 3.0,
         "initial": {"control": {**swing, "amplitude": {"pitch": 1.2, "roll": 0.7}}},
         "parameters": {
             "pitch_damping": {"target": "joint/pitch:damping", "true": 0.12},
@@ -68,6 +68,7 @@ def experiment(home: Path, **load: float) -> mjfim.Experiment:
             "hand_mass": {"target": "body/hand:mass", "true": 0.31},
         },
         "noise": {"qpos:pitch": 0.003, "qpos:roll": 0.003},
+        "fit": {"segments": "whole"},
         "directory": home,
         "source": "arm.toml",
     }
@@ -178,7 +179,7 @@ def test_true_values_are_inside_the_intervals(tmp_path: Path) -> None:
     """Also that of an inertia which the recordings show."""
     robot, loaded = experiment(tmp_path), experiment(tmp_path, **LOAD, inertia=0.02)
     found = []
-    for seed in range(5):
+    for seed in range(3):
         robots = mjfim.identify(robot, [log(robot, seed)])
         estimate = mjfim.identify_payload(
             robot, [log(loaded, 100 + seed)], body="hand", robot=robots
@@ -187,8 +188,9 @@ def test_true_values_are_inside_the_intervals(tmp_path: Path) -> None:
         assert estimate.converged and payload.is_seen and payload.edge is None
         low, high = payload.inertia_interval
         found.append([*inside(estimate), low <= 0.02 <= high])
-    assert np.mean(found) >= 0.85
-    assert (np.mean(found, axis=0) >= 0.6).all()
+    # Of 15 true values, 4 or more are outside of 95 % intervals in 0.5 % of all cases.
+    assert np.sum(found) >= 12
+    assert (np.sum(found, axis=0) >= 2).all()
 
 
 @pytest.mark.slow

@@ -129,7 +129,7 @@ def test_a_selection_that_cannot_predict_left_out_data_says_so(
 ) -> None:
     """The estimate is that of an ordinary identification, with the length that it chooses."""
     monkeypatch.setattr(selection_study, "held_out_losses", lambda *args: None)
-    logs = recorded(tmp_path, 'frictionloss="0.5"', count=2, horizon=1.0)
+    logs = recorded(tmp_path, 'frictionloss="0.5"', count=1, horizon=1.0)
     found = mjfim.select_terms(stated(), logs)
     selection = found.selection
     assert "No part of the recordings could be predicted" in str(selection)

@@ -24,7 +24,8 @@ STATED = {
 
 
 def cart_pendulum(**tables: Any) -> Experiment:
-    """The cart-pendulum with some tables changed."""
+    """The cart-pendulum with some tables changed; few robots rehearse its designs."""
+    tables = {"rehearsal": {"robots": 4}, **tables}
     return Experiment.from_file(MODELS / "cart_pendulum.toml").replace(**tables)
 
 

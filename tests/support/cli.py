@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import re
 import shutil
 import sys
+from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 from unittest.mock import patch
 
@@ -81,6 +84,13 @@ def run(*words: object, answers: str | None = None) -> Result:
     split = [*" ".join(map(str, words[:1])).split(), *map(str, words[1:])]
     with patch.object(typer.testing, "_get_command", command_of):
         return CliRunner().invoke(cli.app, split, input=answers)
+
+
+def called_here(words: Sequence[str], *, folder: Path, **_: Any) -> SimpleNamespace:
+    """A call of `scripts.verbs.call_verb` that runs in this process."""
+    with contextlib.chdir(folder):
+        result = run(*words)
+    return SimpleNamespace(returncode=result.exit_code, stdout=result.stdout, stderr=result.stderr)
 
 
 def done(*words: object, code: int = 0) -> Result:

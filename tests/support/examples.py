@@ -21,7 +21,7 @@ DESIGN_TABLES = {
         f"[cost]\ncontrol = 1e-3\n\n{TOLERANCE}",
     ),
     "dfki_double_pendulum": (
-        2.5,
+        2.4,
         '{ kind = "chirp", amplitude = { shoulder = 0.6, elbow = 0.4 }, '
         "frequency = 0.4, frequency_end = 2.0 }",
         TOLERANCE,

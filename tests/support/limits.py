@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,7 @@ from mjfim.excitation.limits.constraint_kinds import ConstraintValues
 from mjfim.excitation.limits.constraints import ConstraintSet, constraint_set_of
 from mjfim.excitation.search.interior_problem import InteriorProblem
 from mjfim.excitation.task import DesignTask
-from tests.fuzz.player import NEAREST, Layout, play
+from tests.fuzz.player import NEAREST, Layout, Row, play
 from tests.support.numerics import TILT, Array, cart_task, directional_check, make_task
 
 # An arm of two servos on a floating hull: the addresses of positions, velocities, joints and
@@ -181,6 +181,21 @@ def barrier_check(task: DesignTask, delta: float) -> float:
     return slope_check(task, gradient, lambda ctrl: problem.point(ctrl).barrier, ways, 2e-5)
 
 
+def full_rows(model: Any, given: Sequence[dict[str, float]], period: float) -> list[Row]:
+    """Rows of a design.csv whose numbers are zero unless they are given."""
+    layout = Layout(model)
+    names = [name for part in layout.columns for name in part]
+    zero = dict.fromkeys([*names, *(f"ctrl:{name}" for name in layout.drives)], 0.0)
+    zero |= {name: 1.0 for name in names if name.endswith(".qw")}
+    for drive in layout.drives:
+        gains = [
+            f"gain:{drive}:q{kind}:{name}" for kind in ("pos", "vel") for name in layout.freedoms
+        ]
+        zero |= dict.fromkeys(gains, 0.0)
+    assert all(set(row) <= set(zero) for row in given)
+    return [{**zero, **row, "t": period * i} for i, row in enumerate(given)]
+
+
 def excess_of(task: DesignTask, ctrl: Array) -> dict[tuple[str, str], float]:
     """Excess of a control beyond each limit on the model of the user, as a share of half the range.
 
@@ -192,14 +207,9 @@ def excess_of(task: DesignTask, ctrl: Array) -> dict[tuple[str, str], float]:
     layout = Layout(model)
     columns = itertools.chain.from_iterable(layout.columns)
     start = dict(zip(columns, task.plant.nominal_initial_state.tolist(), strict=True))
-    rows = [
-        {
-            **start,
-            "t": k * task.dt,
-            **{f"ctrl:{n}": u for n, u in zip(task.controls, now, strict=True)},
-        }
-        for k, now in enumerate([*ctrl.tolist(), ctrl[-1].tolist()])
-    ]
+    names = [f"ctrl:{name}" for name in task.controls]
+    held = [*ctrl.tolist(), ctrl[-1].tolist()]
+    given = [start | dict(zip(names, now, strict=True)) for now in held]
     ranges = {
         (limit.kind, limit.name): (-limit.upper if limit.is_magnitude else limit.lower, limit.upper)
         for limit in task.limits
@@ -211,7 +221,7 @@ def excess_of(task: DesignTask, ctrl: Array) -> dict[tuple[str, str], float]:
         for name in layout.freedoms:
             ranges["end_position", name] = (-boundary.position, boundary.position)
             ranges["end_velocity", name] = (-boundary.velocity, boundary.velocity)
-    return play(model, rows, ranges, task.dt).found
+    return play(model, full_rows(model, given, task.dt), ranges, task.dt).found
 
 
 # Limits that the cart-pendulum meets quickly.

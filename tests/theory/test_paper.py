@@ -36,7 +36,7 @@ def experiment(case: str = "b", **descent: Any) -> Experiment:
     """The cart-pendulum at the weights of one case."""
     control, slide, place, _ = CASES[case]
     cost = {"control": control, "tracking": {"slide": slide}, "linearize_at": place}
-    return cart_pendulum(cost=cost, descent=descent, rehearsal={"robots": 4})
+    return cart_pendulum(cost=cost, descent=descent)
 
 
 @cache
