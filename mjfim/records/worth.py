@@ -120,7 +120,7 @@ class Worth(ShownRecord):
         return "the wanted σ" if self.is_stated else f"a σ of {100 * DEFAULT_RELATIVE_STD:g} %"
 
     @property
-    def dearest(self) -> list[Price]:
+    def costliest(self) -> list[Price]:
         """The prices, the highest first; those that are not known come last."""
         return sorted(self.prices, key=lambda price: (np.isnan(price.change), price.change))
 

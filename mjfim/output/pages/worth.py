@@ -58,7 +58,7 @@ def headline(worth: Worth) -> str:
 
 
 def _helps(worth: Worth) -> Iterator[str]:
-    """The best sensor, the best added one and the dearest limit, each with the change of σ."""
+    """The best sensor, the best added one and the costliest limit, each with the change of σ."""
     for added in (False, True):
         rows = [each for each in worth.single if each.is_added == added]
         best = min(rows, key=lambda each: worth.ratio(each.improved), default=None)
@@ -66,7 +66,7 @@ def _helps(worth: Worth) -> Iterator[str]:
             what = best.name if added else f"half the noise of {best.name}"
             yield f"{what} ({change(worth, best.improved).partition(' (')[0]})"
     if worth.prices:
-        price = worth.dearest[0]
+        price = worth.costliest[0]
         yield f"{price_name(price)} ({percent(price.change)})"
 
 
@@ -154,9 +154,9 @@ def _price_table(worth: Worth, detail: bool) -> Table:
     return tabulated(
         "Prices: how σ changes where a restriction is relaxed",
         {
-            "restriction": [price_name(price) for price in worth.dearest],
-            "by its multiplier": [percent(price.predicted) for price in worth.dearest],
-            "in a new design": [percent(price.redesigned) for price in worth.dearest],
+            "restriction": [price_name(price) for price in worth.costliest],
+            "by its multiplier": [percent(price.predicted) for price in worth.costliest],
+            "in a new design": [percent(price.redesigned) for price in worth.costliest],
         },
         note="σ is what the criterion minimises: for E-optimality that of the worst combination.",
         detail=detail,

@@ -598,9 +598,9 @@ def _sensors(result: Worth, rows: list[SensorWorth]) -> Panel:
 
 def _prices(result: Worth, rows: int) -> Panel:
     """Return the change of σ where each restriction is relaxed, in as many rows as beside it."""
-    places = np.arange(len(result.dearest))
-    shown = 100.0 * np.array([price.change for price in result.dearest])
-    predicted = 100.0 * np.array([price.predicted for price in result.dearest])
+    places = np.arange(len(result.costliest))
+    shown = 100.0 * np.array([price.change for price in result.costliest])
+    predicted = 100.0 * np.array([price.predicted for price in result.costliest])
     marks = [bars(np.nan_to_num(shown), places, "series0", left=0.0), vline(0.0, "muted")]
     if not np.array_equal(shown, predicted, equal_nan=True):
         look = {"symbol": "|", "size": 12.0, "width": 2.0, "label": "by the multiplier"}
@@ -610,7 +610,7 @@ def _prices(result: Worth, rows: int) -> Panel:
         title="Prices of restrictions",
         marks=marks,
         x=Axis(label="change of σ [%]", most=4),
-        y=row_axis([price_name(price) for price in result.dearest] + rest),
-        beside=[("", "text", [percent(price.change) for price in result.dearest] + rest)],
+        y=row_axis([price_name(price) for price in result.costliest] + rest),
+        beside=[("", "text", [percent(price.change) for price in result.costliest] + rest)],
         place=(0, 1),
     )
