@@ -143,10 +143,3 @@ def test_a_walk_ends_with_the_parameters_of_the_robot(
     assert found.safe is (found.kept > 0.95)
     assert found.inside is not None
     assert found.parameters
-
-
-@pytest.mark.slow
-def test_a_model_that_init_refuses_has_a_row(tmp_path: Path) -> None:
-    found = walk(tmp_path / "absent.xml", tmp_path / "walk")
-    assert found.codes == {"init": 2}
-    assert "no such file" in found.messages["init"]

@@ -71,7 +71,7 @@ def limited_task(folder: Path, **descent: float) -> DesignTask:
 
 def small_task(folder: Path) -> DesignTask:
     """The task of a design from several starts."""
-    return limited_task(folder, starts=3, max_iterations=5)
+    return limited_task(folder, starts=3, max_iterations=12)
 
 
 @pytest.fixture(scope="module")
