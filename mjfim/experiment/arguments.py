@@ -112,6 +112,9 @@ def _fits(value: Any, hint: Any) -> bool:
         return any(_fits(value, part) for part in parts)
     if kind is Literal:
         return isinstance(value, str) and value in parts
+    if kind is tuple and Ellipsis not in parts:
+        is_whole = isinstance(value, (list, tuple)) and len(value) == len(parts)
+        return is_whole and all(map(_fits, value, parts))
     if kind in (Sequence, tuple):
         return isinstance(value, (list, tuple)) and all(_fits(each, parts[0]) for each in value)
     if kind is Mapping:
