@@ -50,7 +50,7 @@ def test_random_cases() -> None:
     cases = [Case(kind=kind, seed=seed) for kind, seeds in CASES.items() for seed in seeds]
     outcomes = list(run_cases(cases, workers=1, seconds=PATIENCE))
     replay = [
-        f"python -m tests.fuzz --only {o.case}: {o.complaint}" for o in outcomes if o.complaint
+        f"python -m scripts.fuzz --only {o.case}: {o.complaint}" for o in outcomes if o.complaint
     ]
     assert len(outcomes) == len(cases)
     assert replay == []

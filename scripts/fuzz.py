@@ -1,4 +1,4 @@
-"""Run the fuzz suite by hand: `python -m tests.fuzz --problems 500 --inputs 1000 --kills 200`."""
+"""Run the fuzz suite by hand: `python -m scripts.fuzz --problems 500 --inputs 1000 --kills 200`."""
 
 from __future__ import annotations
 
