@@ -29,7 +29,7 @@ from mjfim.files import read_arrays, write_arrays, write_json
 RECORD = "record"
 
 # Version of the files; another one is refused.
-VERSION = 4
+VERSION = 5
 
 # Largest number of characters of one value, and of entries of a sequence, in a short text.
 MAX_VALUE_LENGTH = 48
