@@ -206,7 +206,7 @@ FAULTS = [
         rf"'initial\.trajectory\.qpos': .*the array 'initial_qpos' is missing; {AGAIN}",
     ),
     ("theta", np.array(["a"]), r"the array 'theta' does not hold numbers"),
-    ("version", 99, rf"design\.npz: has version 99, not 4; {AGAIN}"),
+    ("version", 99, rf"design\.npz: has version 99, not 5; {AGAIN}"),
     ("type", "Check", r"design\.npz: holds a record of type Check, not Design"),
     ("colour", "red", r"the field 'colour': Unexpected keyword"),
     ("status", "BORED", r"the field 'status': Input should be .*converged"),
