@@ -126,7 +126,7 @@ def test_a_check_says_which_limits_the_start_violates_and_when(tmp_path: Path) -
 def test_a_motion_without_a_regulator_fails_the_self_test_without_a_traceback(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(study_check, "slope_error", Mock(side_effect=np.linalg.LinAlgError))
+    monkeypatch.setattr(study_check, "LBFGS", Mock(side_effect=np.linalg.LinAlgError))
     found = check_task(stiff_arm_task(tmp_path, amplitude=1e-3))
     assert np.isinf(found.self_test.slope)
     assert not found.self_test.passed
