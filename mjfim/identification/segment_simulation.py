@@ -279,7 +279,8 @@ class SegmentSimulation(FitUnknowns):
         """
         longest = max(self.segments[i].samples for i in batch.segments)
         begins = np.array([self.segments[i].begin for i in batch.segments])
-        lead = min(self.system.plant.lead(theta), int(begins.max()) + 1)
+        # The last interval of a segment needs no more than all inputs before its end.
+        lead = min(self.system.plant.lead(theta), int(begins.max()) + longest)
         return self.system.plant.derivatives.responses(
             theta,
             np.stack([self.initial_state(at, i) for i in batch.segments]),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partialmethod
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from mjfim.errors import ExperimentError, SimulationDivergedError
 from mjfim.experiment.system import System
 from mjfim.identification.aligned_recording import AlignedRecording
 from mjfim.identification.fit_problem import FitProblem
+from mjfim.plant.plant import Derivatives
 from mjfim.records.trajectory import Recording
 from tests.support import terms
 from tests.support.closed_loop import ARM, PlainLaw, arm_experiment, simulate
@@ -107,23 +109,20 @@ def test_a_limit_that_the_law_hardly_reaches_leaves_the_others_determined(
     assert any("not identifiable separately: limit" in sentence for sentence in found.warnings)
 
 
-def test_a_latency_longer_than_the_log_holds_the_first_reference() -> None:
-    """A search without bounds may try it."""
-    late = {**GAINS["latency"], "guess": 1e15, "nuisance": False}
+def test_intervals_of_a_simulation_take_all_earlier_references(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Also where a search without bounds tries a latency longer than the log."""
+    late = {"target": "controller/elbow:latency", "guess": 0.05}
     laws = {"shoulder": SHOULDER, "elbow": ELBOW}
-    experiment = arm_experiment(
-        laws, parameters={"latency": late}, noise=NOISE, fit={"segments": 0.1}
-    )
-    system, log = System.resolve(experiment), log_of(experiment, 200, 1)
-    held = replace(log, ctrl=np.broadcast_to(log.ctrl[0], log.ctrl.shape))
-    late_cost, held_cost = (
-        problem.cost(problem.begin(theta))
-        for problem, theta in (
-            (FitProblem.of(system, [log]), np.array([1e15])),
-            (FitProblem.of(system, [held]), np.array([0.0])),
-        )
-    )
-    assert late_cost == held_cost
+    experiment = arm_experiment(laws, parameters={**PLANT, "late": late}, noise=NOISE)
+    problem = FitProblem.of(System.resolve(experiment), [log_of(experiment, 200, 1)])
+    at = [problem.begin(np.array([1.2, 0.3, latency])) for latency in (0.05, 1.0, 1e15)]
+    costs = [problem.cost(each) for each in at]
+    assert costs[0] != costs[1] == costs[2]
+    intervals = partialmethod(Derivatives.responses, max_numbers=1000)
+    monkeypatch.setattr(Derivatives, "responses", intervals)
+    assert_allclose([problem.cost(each) for each in at], costs, rtol=1e-12)
 
 
 def test_derivatives_agree_with_differences_of_a_plain_loop() -> None:

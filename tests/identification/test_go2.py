@@ -65,6 +65,7 @@ def test_fits_to_a_second_predict_another(
     """Each of two seconds predicts the other better than the model as it comes."""
     halves = {"first": (slice(4200, 4400),), "second": (slice(4400, 4600),)}
     monkeypatch.setattr(go2, "HALVES", halves)
+    monkeypatch.setattr(go2, "LEG", go2.LEG.replace("max_iterations = 25", "max_iterations = 8"))
     monkeypatch.setattr("sys.argv", ["go2", str(DATA), str(MODEL), str(tmp_path)])
 
     assert go2.main() == 0

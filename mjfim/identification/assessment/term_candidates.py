@@ -227,7 +227,9 @@ def _law_numbers(system: System) -> Iterator[Candidate]:
                 path, size = f"controller/{law.actuator}:{name}", sizes.get(name, time)
                 number = _number(system, path, size, positive=True)
                 number = replace(number, begin=max(number.begin, begins.get(name, 0.0)))
-                yield _at_joint(words, law.actuator, law.joint, number)
+                candidate = _at_joint(words, law.actuator, law.joint, number)
+                # The other numbers are linearised without filters.
+                yield replace(candidate, alone=name if name in begins else "")
 
 
 def _gains(system: System) -> Iterator[Candidate]:
