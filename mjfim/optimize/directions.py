@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
+from typing import Any
 
 import numpy as np
 import scipy
@@ -126,8 +127,24 @@ class MetricDescent(Direction):
         return TangentCurve(z=zeta.z[:, :nx], v=zeta.v)
 
 
+class PairMemory:
+    """Pairs of changes of iterates and gradients, which a direction remembers."""
+
+    _pairs: tuple[Any, ...]
+
+    def reset(self) -> bool:
+        """Clear the memory.
+
+        Returns:
+            True if there was something to clear.
+        """
+        had_pairs = bool(self._pairs)
+        self._pairs = ()
+        return had_pairs
+
+
 @dataclass
-class LBFGS:
+class LBFGS(PairMemory):
     """Limited-memory BFGS in the curve coordinate `c = u + K x`.
 
     In this coordinate, P(xi + gamma zeta) is affine in gamma. The initial Hessian is the control
@@ -209,16 +226,6 @@ class LBFGS:
             pairs.append((s, y, float(np.vdot(s, y))))
 
         return LBFGS(R, self.memory, tuple(pairs))
-
-    def reset(self) -> bool:
-        """Clear the memory.
-
-        Returns:
-            True if there was something to clear.
-        """
-        had_pairs = bool(self._pairs)
-        self._pairs = ()
-        return had_pairs
 
 
 # ---- direction under hard limits
@@ -443,7 +450,7 @@ class _LocalModel:
 
 
 @dataclass
-class StructuredBFGS:
+class StructuredBFGS(PairMemory):
     """Quasi-Newton direction with a structured Hessian.
 
     The Hessian is the sum of the barrier's Gauss-Newton Hessian, the Hessian of the eigenvalue
@@ -616,16 +623,6 @@ class StructuredBFGS:
 
         y = after.cost_gradient - before.cost_gradient - before.predicted_change(s)
         self._pairs = (*self._pairs, (s, y))[-self.memory :]
-
-    def reset(self) -> bool:
-        """Clear the memory.
-
-        Returns:
-            True if there was something to clear.
-        """
-        had_pairs = bool(self._pairs)
-        self._pairs = ()
-        return had_pairs
 
     def _local_model(self, expansion: Expansion, K: Array) -> _LocalModel:
         """Gradients and weights at an expansion, computed once per expansion and regulator."""
