@@ -52,7 +52,7 @@ def design(
 
     from mjfim.excitation.shortest_horizon import OutOfReachError
     from mjfim.excitation.task import DesignTask
-    from mjfim.excitation.task_parts import require_design_keys
+    from mjfim.experiment.controls import require_design_keys
     from mjfim.experiment.system import System
 
     if starts is not None:

@@ -30,6 +30,7 @@ from mjfim.excitation.initial_controls import (
 )
 from mjfim.excitation.limits.verification import all_violations_of, require_feasible_start, verify
 from mjfim.excitation.objective import DesignPoint
+from mjfim.excitation.prior_information import EarlierExperiments
 from mjfim.excitation.rehearsal import rehearse_task, with_cures_tried
 from mjfim.excitation.release import design_release
 from mjfim.excitation.search.climb import Candidate
@@ -37,8 +38,8 @@ from mjfim.excitation.search.levels import DescentLevel, require_coarse_factor
 from mjfim.excitation.search.search import Search
 from mjfim.excitation.sensors import sensing_along
 from mjfim.excitation.task import DesignTask
-from mjfim.excitation.task_parts import EarlierExperiments, require_controls
 from mjfim.experiment.arguments import checked
+from mjfim.experiment.controls import require_controls
 from mjfim.experiment.schema import ExperimentLike, experiment_of
 from mjfim.experiment.system import labels_of_system
 from mjfim.information.criteria import shared

@@ -27,9 +27,14 @@ from mjfim.excitation.limits.verification import (
 from mjfim.excitation.objective import DesignPoint
 from mjfim.excitation.search.levels import DescentLevel, regulator_for
 from mjfim.excitation.task import DesignTask
-from mjfim.excitation.task_parts import require_design_keys, stated_motion
 from mjfim.experiment.arguments import checked
+from mjfim.experiment.controls import (
+    require_design_keys,
+    require_horizon_and_control,
+    stated_inputs,
+)
 from mjfim.experiment.given import TrajectoryLike, check_fits
+from mjfim.experiment.packing import named_file
 from mjfim.experiment.schema import ExperimentLike
 from mjfim.experiment.stated_units import probable_degrees
 from mjfim.experiment.system import System, simulate_system
@@ -188,7 +193,10 @@ def motion_of(system: System, given: TrajectoryLike | None, work: str) -> Trajec
     """
     if given is None:
         if system.laws is not None:
-            return stated_motion(system)
+            require_horizon_and_control(system, work)
+            with named_file(system.experiment):
+                inputs = stated_inputs(system)
+            return system.plant.simulate(system.theta, inputs)
         require_design_keys(system, work)
         return DesignTask.of(system).initial
     found = given.trajectory if isinstance(given, Design) else given

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
+from typing import Literal
 
 import numpy as np
+import scipy
 
 from mjfim.arrays import Array, record
-from mjfim.errors import SimulationDivergedError
-from mjfim.excitation.task_parts import ParameterSamples
+from mjfim.errors import ExperimentError, SimulationDivergedError
+from mjfim.experiment.system import System
 from mjfim.information.criteria import Criterion
 from mjfim.information.fisher import FisherInformation
+from mjfim.model.parameters import sample_parameters
 from mjfim.optimize.lq import TangentCurve
 from mjfim.optimize.projection_operator import Expansion
 from mjfim.plant.batch import SubstepObservations
@@ -23,6 +27,9 @@ from mjfim.plant.mixed_derivatives import (
 from mjfim.plant.plant import LumpedParameters, Plant
 from mjfim.plant.state_space import StateSpace
 from mjfim.records.trajectory import Sensitivity, Trajectory
+
+# Exponent q of the smooth maximum.
+POOLING_EXPONENT = 20.0
 
 
 @record
@@ -118,6 +125,92 @@ DIVERGED = DesignPoint(
     cost=np.inf,
     accuracy=FORWARD_DIFFERENCES,
 )
+
+
+@record
+class ParameterSamples:
+    """Parameter samples, and how the criterion is pooled over them.
+
+    Attributes:
+        thetas: (S, p) parameter values, the guess first [theta-unit].
+        over: "mean" or "worst".
+        logarithmic: True where phi is a logarithm, as for D-optimality.
+    """
+
+    thetas: Array
+    over: Literal["mean", "worst"]
+    logarithmic: bool = False
+
+    @classmethod
+    def of(cls, system: System) -> ParameterSamples | None:
+        """Parameter values over which a robust design pools its criterion.
+
+        Args:
+            system: The system.
+
+        Returns:
+            The samples; None where `[robust]` is not stated.
+
+        Raises:
+            ExperimentError: The parameters cannot be sampled, or the descent weighs psi.
+        """
+        experiment = system.experiment
+        robust = experiment.robust
+        if robust is None:
+            return None
+        if experiment.descent.psi_weight:
+            raise ExperimentError(
+                "robust: descent.psi_weight is for a design at one parameter value; remove one of "
+                "them"
+            )
+
+        thetas = sample_parameters(
+            system.parameters, system.theta, robust.samples, robust.seed, system.impossible
+        )
+        return cls(thetas=thetas, over=robust.over, logarithmic=experiment.cost.criterion == "D")
+
+    def value(self, phi: Sequence[float]) -> float:
+        """Pool the criterion over the samples.
+
+        Args:
+            phi: S values of the criterion.
+
+        Returns:
+            The pooled value; infinite where a value is not finite.
+        """
+        q = POOLING_EXPONENT
+        values = np.asarray(phi, dtype=np.float64)
+        if not np.isfinite(values).all():
+            return np.inf
+
+        if self.over == "mean":
+            return float(values.mean())
+        if self.logarithmic:
+            return float((scipy.special.logsumexp(q * values) - np.log(len(values))) / q)
+
+        # Divide by the largest value, so that powers neither overflow nor vanish.
+        largest = values.max()
+        return float(largest * np.mean((values / largest) ** q) ** (1.0 / q))
+
+    def weights(self, phi: Sequence[float]) -> Array:
+        """Differentiate the pooled criterion.
+
+        Args:
+            phi: S values of the criterion, all finite.
+
+        Returns:
+            (S,) derivative by each value.
+        """
+        q = POOLING_EXPONENT
+        values = np.asarray(phi, dtype=np.float64)
+
+        if self.over == "mean":
+            return np.full(len(values), 1.0 / len(values))
+        if self.logarithmic:
+            return np.asarray(np.exp(q * values - scipy.special.logsumexp(q * values)))
+
+        pooled = self.value(phi)
+        return np.asarray((values / pooled) ** (q - 1.0) / len(values))
 
 
 @record

@@ -19,10 +19,10 @@ from mjfim.errors import SimulationDivergedError
 from mjfim.excitation.evaluation import UNSTABLE_GROWTH
 from mjfim.excitation.limits.limits import ReleaseSpace
 from mjfim.excitation.objective import DIVERGED, DesignPoint
+from mjfim.excitation.prior_information import EarlierExperiments
 from mjfim.excitation.search.climb import Candidate, row_of
 from mjfim.excitation.search.levels import DescentLevel
 from mjfim.excitation.task import DesignTask
-from mjfim.excitation.task_parts import EarlierExperiments
 from mjfim.experiment.packing import for_workers
 from mjfim.experiment.schema import Experiment
 from mjfim.optimize.lq import largest_amplification

@@ -30,8 +30,8 @@ from mjfim.errors import (
 from mjfim.excitation.design import design_budget, design_task
 from mjfim.excitation.search.levels import MIN_COARSE_SAMPLES, SAMPLE_FACTORS
 from mjfim.excitation.task import DesignTask
-from mjfim.excitation.task_parts import require_controls
 from mjfim.experiment.arguments import checked
+from mjfim.experiment.controls import require_controls
 from mjfim.experiment.packing import opened
 from mjfim.experiment.schema import Experiment, ExperimentLike
 from mjfim.experiment.system_tables import Signal

@@ -10,30 +10,23 @@ from functools import cached_property
 import numpy as np
 
 from mjfim.arrays import Array, record
-from mjfim.errors import ExperimentError, SimulationDivergedError
+from mjfim.errors import ExperimentError, SimulationDivergedError, listed, unknown
 from mjfim.excitation.limits.limits import Limit, ReleaseSpace, limits_of, limits_of_model
-from mjfim.excitation.objective import DesignProblem, RunningCost
-from mjfim.excitation.task_parts import (
-    EarlierExperiments,
-    ParameterSamples,
-    contrast_of,
+from mjfim.excitation.objective import DesignProblem, ParameterSamples, RunningCost
+from mjfim.excitation.prior_information import EarlierExperiments, known_from
+from mjfim.experiment.controls import (
     holding_control,
-    known_from,
     least_drift_control,
-    named_file,
-    parameter_samples_of,
-    require_bounded_controls,
     require_design_keys,
     stated_control,
-    tracking_weights_of,
 )
 from mjfim.experiment.initial import keyframe, multisine, spline_basis
-from mjfim.experiment.packing import opened
+from mjfim.experiment.packing import named_file, opened
 from mjfim.experiment.schema import Experiment, ExperimentLike, by_name
 from mjfim.experiment.system import System
 from mjfim.information.fisher import FisherInformation
 from mjfim.information.identifiability import IdentifiabilityTest
-from mjfim.model.coordinates import actuator_names, joint_names
+from mjfim.model.coordinates import actuator_names, joint_dofs, joint_names
 from mjfim.model.elements import unique_names
 from mjfim.model.parameters import ParameterSet
 from mjfim.model.variants import ModelVariant, Relaxation, has_dry_friction, smoothing_speeds_of
@@ -163,7 +156,7 @@ class DesignTask:
 
         weight = by_name("cost.control", experiment.cost.control, names, "actuator")
         if weighted:
-            require_bounded_controls(system, limits, weight)
+            _require_bounded_controls(system, limits, weight)
 
         about = system.rest
         if experiment.cost.control_about is not None:
@@ -193,14 +186,14 @@ class DesignTask:
             control=control,
             reference=reference,
             limits=limits,
-            tracking=tracking_weights_of(system),
+            tracking=_tracking_weights(system),
             control_weight=weight,
             control_about=about,
-            contrast=contrast_of(system),
+            contrast=_contrast(system),
             prior_information=earlier.information,
             added=added,
             inflation=earlier.inflation,
-            samples_of_parameters=parameter_samples_of(system),
+            samples_of_parameters=ParameterSamples.of(system),
             release=ReleaseSpace.of(system, limits),
         )
 
@@ -705,3 +698,82 @@ def _calibrated(
     if factors is not None and (moves_alike or is_rescaled):
         return replace(system, plant=system.plant.with_step_factors(factors)), trajectory
     return system.calibrated_along(system.theta, trajectory), trajectory
+
+
+def _require_bounded_controls(system: System, limits: tuple[Limit, ...], weight: Array) -> None:
+    """Check that a weight or an enforced range bounds every control.
+
+    Args:
+        system: The system.
+        limits: All limits.
+        weight: (nu,) weights of the controls in the running cost.
+
+    Raises:
+        ExperimentError: Neither bounds a control.
+    """
+    enforced = system.experiment.limits.enforce
+    bounded = {limit.name for limit in limits if limit.kind == "control"} if enforced else set()
+
+    for name, value in zip(system.controls, weight.tolist(), strict=True):
+        if value <= 0.0 and name not in bounded:
+            raise ExperimentError(
+                f"cost.control: actuator {name!r} has neither a weight nor a range; it needs a "
+                f"weight > 0, or a hard limit: limits.control.{name} = [lower, upper]"
+            )
+
+
+def _tracking_weights(system: System) -> Array:
+    """Weights on deviations from the initial trajectory.
+
+    Args:
+        system: The system.
+
+    Returns:
+        (nx,) diagonal of Q_tau; the weight of a joint holds for each of its degrees of freedom.
+
+    Raises:
+        ExperimentError: A table names an unknown joint.
+    """
+    cost, model = system.experiment.cost, system.model
+    names = joint_names(model)
+    widths = [joint_dofs(model, j) for j in range(model.njnt)]
+
+    position = by_name("cost.tracking", cost.tracking, names, "joint")
+    velocity = by_name("cost.tracking_velocity", cost.tracking_velocity, names, "joint")
+    return np.concatenate(
+        [np.repeat(position, widths), np.repeat(velocity, widths), np.zeros(model.na)]
+    )
+
+
+def _contrast(system: System) -> Array | None:
+    """Combinations whose variances criterion "c" sums.
+
+    Args:
+        system: The system.
+
+    Returns:
+        (t, c) combinations of the scaled wanted parameters; None for other criteria.
+
+    Raises:
+        ExperimentError: A named parameter is not a wanted one, or no parameter is named.
+    """
+    cost, parameters = system.experiment.cost, system.parameters
+    if cost.criterion != "c":
+        return None
+
+    wanted = tuple(parameters.names[j] for j in parameters.interest)
+    scale = parameters.scale[parameters.interest]
+    key = "combination" if cost.combination else "subset"
+    chosen = tuple(cost.combination or cost.subset or ())
+
+    for name in chosen:
+        if name not in wanted:
+            raise ExperimentError(f"cost.{key}: {unknown('wanted parameter', name, wanted)}")
+    if not chosen:
+        raise ExperimentError(f"cost.subset: it names no parameter; valid: {listed(wanted)}")
+
+    # One combination of all parameters, or each chosen parameter in the unit of its scale.
+    if cost.combination:
+        coefficients = [cost.combination.get(name, 0.0) for name in wanted]
+        return np.asarray((np.array(coefficients) * scale)[:, None])
+    return np.asarray(np.eye(len(wanted))[:, [wanted.index(name) for name in chosen]])

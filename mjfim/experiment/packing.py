@@ -7,10 +7,19 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from mjfim.errors import ModelError
+from mjfim.errors import ExperimentError, ModelError
 from mjfim.experiment.schema import Experiment
 from mjfim.model.loading import ModelSource, packed_model
 from mjfim.model.model_files import PackedFiles, files_of_model
+
+
+@contextmanager
+def named_file(experiment: Experiment) -> Iterator[None]:
+    """Put the name of the experiment file before the message of an ExperimentError."""
+    try:
+        yield
+    except ExperimentError as error:
+        raise ExperimentError(f"{experiment.source}: {error}") from None
 
 
 def input_files(

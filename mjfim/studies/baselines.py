@@ -18,11 +18,11 @@ import scipy.signal
 from mjfim.arrays import Array, record
 from mjfim.excitation.design import consume
 from mjfim.excitation.initial_controls import series_of
+from mjfim.excitation.prior_information import EarlierExperiments
 from mjfim.excitation.search.inside import largest_share
 from mjfim.excitation.search.levels import DescentLevel
 from mjfim.excitation.search.search import Search
 from mjfim.excitation.task import DesignTask
-from mjfim.excitation.task_parts import EarlierExperiments
 from mjfim.experiment.schema import Experiment
 from mjfim.parallel import one_blas_thread, pool_stop_token
 from mjfim.parallel.budget import Budget, StopToken

@@ -29,13 +29,13 @@ from mjfim.errors import (
 )
 from mjfim.excitation.design import design_budget, design_task
 from mjfim.excitation.evaluation import criterion_of
+from mjfim.excitation.prior_information import EarlierExperiments, expected_inflation
 from mjfim.excitation.shortest_horizon import (
     largest_ratio_to_target,
     require_reachable,
     target_accuracies,
 )
 from mjfim.excitation.task import DesignTask
-from mjfim.excitation.task_parts import EarlierExperiments, expected_inflation
 from mjfim.experiment.arguments import checked
 from mjfim.experiment.given import RecordingsLike, recordings_of
 from mjfim.experiment.schema import Experiment, ExperimentLike, experiment_of

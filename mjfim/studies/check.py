@@ -37,8 +37,8 @@ from mjfim.excitation.task import (
     RANDOM_HARMONICS,
     DesignTask,
 )
-from mjfim.excitation.task_parts import require_design_keys
 from mjfim.experiment.arguments import checked
+from mjfim.experiment.controls import require_design_keys
 from mjfim.experiment.given import RecordingsLike, TrajectoryLike, recordings_of
 from mjfim.experiment.initial import multisine
 from mjfim.experiment.schema import ExperimentLike

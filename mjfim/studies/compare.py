@@ -28,8 +28,8 @@ from mjfim.excitation.limits.verification import (
 from mjfim.excitation.search.inside import InsideSearch
 from mjfim.excitation.search.levels import DescentLevel
 from mjfim.excitation.task import DesignTask
-from mjfim.excitation.task_parts import require_controls
 from mjfim.experiment.arguments import checked
+from mjfim.experiment.controls import require_controls
 from mjfim.experiment.packing import for_workers
 from mjfim.experiment.schema import ExperimentLike
 from mjfim.experiment.system import System

@@ -29,8 +29,8 @@ from mjfim.errors import (
 from mjfim.excitation.limits.limits import limits_of_model
 from mjfim.excitation.limits.verification import verify, violations_of
 from mjfim.excitation.task import DesignTask
-from mjfim.excitation.task_parts import MAX_SAMPLES
 from mjfim.experiment.arguments import checked
+from mjfim.experiment.controls import MAX_SAMPLES
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
 from mjfim.model.coordinates import joint_dofs

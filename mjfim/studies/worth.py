@@ -23,8 +23,8 @@ from mjfim.excitation.search.interior_problem import DIVERGED_POINT
 from mjfim.excitation.search.levels import DescentLevel
 from mjfim.excitation.sensors import sensing_along
 from mjfim.excitation.task import DesignTask
-from mjfim.excitation.task_parts import require_design_keys
 from mjfim.experiment.arguments import checked
+from mjfim.experiment.controls import require_design_keys
 from mjfim.experiment.given import check_fits
 from mjfim.experiment.schema import Experiment, ExperimentLike, experiment_of
 from mjfim.experiment.system import System

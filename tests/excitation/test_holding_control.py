@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from mjfim.excitation.limits.verification import require_feasible_start
-from mjfim.excitation.task_parts import holding_control, least_drift_control
+from mjfim.experiment.controls import holding_control, least_drift_control
 from tests.support.numerics import make_task
 from tests.support.stiff_servos import START, stiff_arm_task
 

@@ -8,8 +8,8 @@ import pytest
 import mjfim
 from mjfim.errors import ExperimentError, UnidentifiableError
 from mjfim.excitation.design import design_task
+from mjfim.excitation.prior_information import EarlierExperiments
 from mjfim.excitation.task import DesignTask
-from mjfim.excitation.task_parts import EarlierExperiments
 from tests.support.numerics import CART_PARAMETERS, cart_task, relative_error
 
 NEAR = {

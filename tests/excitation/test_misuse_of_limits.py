@@ -11,7 +11,7 @@ import mjfim
 from mjfim.errors import ExperimentError
 from mjfim.excitation.design import design_task
 from mjfim.excitation.task import DesignTask
-from mjfim.excitation.task_parts import holding_control
+from mjfim.experiment.controls import holding_control
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
 from mjfim.output import folders

@@ -12,7 +12,7 @@ from scipy.special import polygamma
 
 from mjfim.errors import ExperimentError
 from mjfim.excitation.design import design_task
-from mjfim.excitation.task_parts import expected_inflation, known_from
+from mjfim.excitation.prior_information import expected_inflation, known_from
 from mjfim.output import archive
 from mjfim.output.words import sigma_remark
 from mjfim.studies.check import check_task

@@ -13,8 +13,8 @@ from scipy.stats import norm
 import mjfim
 from mjfim.errors import ExperimentError
 from mjfim.excitation.design import design_task
+from mjfim.excitation.objective import ParameterSamples
 from mjfim.excitation.task import DesignTask
-from mjfim.excitation.task_parts import ParameterSamples
 from mjfim.model.parameter_writer import ParameterWriter
 from mjfim.model.parameters import Parameter, ParameterSet, sample_parameters
 from mjfim.records.design import Design

@@ -12,7 +12,7 @@ from numpy.testing import assert_allclose
 import mjfim
 from mjfim.arrays import Array
 from mjfim.errors import ExperimentError, RecordingError
-from mjfim.excitation.task_parts import stated_inputs
+from mjfim.experiment.controls import stated_inputs
 from mjfim.experiment.system import System
 from mjfim.model.control_laws import Quantity
 from mjfim.recordings.read import read_recording

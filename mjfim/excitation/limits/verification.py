@@ -29,7 +29,7 @@ from mjfim.excitation.limits.constraints import (
 )
 from mjfim.excitation.limits.limits import Limit
 from mjfim.excitation.task import DesignTask
-from mjfim.excitation.task_parts import named_file
+from mjfim.experiment.packing import named_file
 from mjfim.model.units import LENGTH
 from mjfim.model.variants import unconstrained
 from mjfim.plant.batch import BatchSimulator, SubstepObservations

@@ -16,11 +16,11 @@ from mjfim.arrays import Array, record
 from mjfim.errors import SimulationDivergedError
 from mjfim.excitation.limits.verification import verify
 from mjfim.excitation.objective import DesignPoint
+from mjfim.excitation.prior_information import EarlierExperiments
 from mjfim.excitation.search.descent import Barrier, FreeMemory, Ground, Step
 from mjfim.excitation.search.inside import InsideSearch, with_corrected_end
 from mjfim.excitation.search.levels import DescentLevel
 from mjfim.excitation.task import DesignTask
-from mjfim.excitation.task_parts import EarlierExperiments
 from mjfim.experiment.schema import Experiment
 from mjfim.model.variants import ModelVariant
 from mjfim.parallel import (
