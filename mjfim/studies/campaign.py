@@ -211,8 +211,9 @@ def run_campaign(
         callback: Called with the events of every design and estimation, and with a `StudyEvent`
             after every round, whose `result` is the `Round`.
         threads: Threads of MuJoCo; None for all cores.
-        done: Design and recordings of each round that is recorded already, which is not designed
-            again; None in place of the design for recordings that were made without one.
+        done: Rounds that are recorded already and not designed again. A `RecordedRound` is a tuple
+            (design, recordings), where `recordings` is a tuple of `Recording`, and `design` is None
+            for recordings that were made without one.
         executor: Where the work is done (`mjfim.ExecutorLike`); None for this process. It
             divides every design and every estimate.
         stop: Ends the campaign early, as Ctrl-C does, after the last complete round.
