@@ -1,30 +1,18 @@
-"""Studies on workers that lose tasks: the same results as in one process, to the last digit."""
+"""Work on workers that lose tasks: the same results as in one process, to the last digit."""
 
 from __future__ import annotations
 
-import pytest
-from numpy.testing import assert_array_equal
+from pathlib import Path
 
-import mjfim
+import pytest
+
+from mjfim.excitation.design import design_task
 from mjfim.excitation.task import DesignTask
-from mjfim.studies import monte_carlo
+from mjfim.parallel import dispatch
 from mjfim.studies.check import check_task
 from tests.support.cart_pendulum import cart_pendulum
 from tests.support.executors import LosingThreads
-
-
-def test_trials_do_not_depend_on_lost_tasks(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Two chunks of three trials, with little noise, so that all converge soon."""
-    monkeypatch.setattr(monte_carlo, "MIN_CHUNK", 3)
-    experiment = cart_pendulum(horizon=0.2, noise={"state": 0.0005})
-    initial = DesignTask.resolve(experiment, threads=1).initial
-    numbers = {"trials": 6, "seed": 3, "threads": 1}
-    alone = mjfim.monte_carlo(experiment, initial, **numbers).sets["final"]
-    with LosingThreads() as threads:
-        study = mjfim.monte_carlo(experiment, initial, executor=threads, **numbers)
-    assert threads.submitted == 3
-    assert_array_equal(study.sets["final"].estimates, alone.estimates)
-    assert_array_equal(study.sets["final"].covariance, alone.covariance)
+from tests.support.limits import cart_inside
 
 
 def test_random_motions_of_a_check_do_not_depend_on_lost_tasks() -> None:
@@ -37,3 +25,14 @@ def test_random_motions_of_a_check_do_not_depend_on_lost_tasks() -> None:
     assert threads.submitted > 3
     assert alone.not_excited and not alone.not_separable
     assert found.findings == alone.findings
+
+
+def test_lost_moves_of_a_design_are_done_here(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(dispatch, "MAX_LOSSES", 1)
+    few = {"descent": {"starts": 2, "max_iterations": 1}, "rehearsal": {"robots": 2}}
+    task = cart_inside(tmp_path, **few)
+    with LosingThreads() as threads:
+        found = design_task(task, executor=threads)
+    assert [each.cost for each in found.starts] == [each.cost for each in design_task(task).starts]
