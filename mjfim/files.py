@@ -260,8 +260,6 @@ def read_arrays(path: Path, kind: str) -> dict[str, np.ndarray]:
     """
     import numpy as np
 
-    if path.is_dir():
-        raise RecordingError(f"{path}: this is a folder; name the {kind} file (.npz) in it")
     if not path.is_file():
         raise RecordingError(f"{path}: no such {kind} file")
 

@@ -605,6 +605,8 @@ def _require_inputs(arguments: Mapping[str, Any]) -> None:
             # Episodes of a dataset, whose names have no ending, are no files of their own.
             if path.suffix and not path.exists():
                 raise RecordingError(f"{path}: no such file")
+            if key == "design_file" and path.suffix != ".npz":
+                raise RecordingError(f"{path}: give the folder of a design, or its file design.npz")
 
 
 def _carry_out(function: Verb, arguments: Mapping[str, Any], options: Mapping[str, Any]) -> None:

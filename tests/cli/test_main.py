@@ -16,6 +16,7 @@ MISUSES = [
     ("design gone.toml -o new", "gone.toml: no such file"),
     ("simulate study.toml gone.npz -o new/r.csv", "gone.npz: no such file"),
     ("simulate study.toml empty", "empty/design.npz: no such file"),
+    ("simulate study.toml study.toml", "study.toml: give the folder of a design"),
     ("montecarlo study.toml gone.npz -o new", "gone.npz: no such file"),
     ("identify study.toml gone.csv -o new", "gone.csv: no such file"),
     ("identify study.toml run.csv notes.txt -o new", "notes.txt: column 't' is missing"),

@@ -169,17 +169,6 @@ def altered(source: Path, path: Path, **arrays: Any) -> Path:
 
 
 @pytest.mark.parametrize(
-    ("name", "said"),
-    [("gone.npz", "no such design file"), ("", "this is a folder; name the design file")],
-)
-def test_a_missing_file_and_a_folder_are_named(
-    name: str, said: str, task: DesignTask, tmp_path: Path
-) -> None:
-    with pytest.raises(RecordingError, match=said):
-        archive.read_design(tmp_path / name, task.system)
-
-
-@pytest.mark.parametrize(
     ("name", "array", "said"),
     [
         ("ctrl", None, "array 'ctrl' is missing; a design holds t, qpos, .*ctrl"),
