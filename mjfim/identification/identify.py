@@ -542,7 +542,7 @@ def refit_task(
     near: FitResult,
     workers: FitWorkers | None = None,
     *,
-    is_rough: bool = True,
+    is_only_compared: bool = True,
     other_start: Array | None = None,
 ) -> FitResult:
     """Search for the parameters of a task near its start, where a similar fit has ended.
@@ -551,7 +551,7 @@ def refit_task(
         search: The searches, with the start of the task.
         near: The similar fit, which has the initial states of the begin.
         workers: Workers that do parts of the work; None for this process.
-        is_rough: Whether the fit is only compared with others.
+        is_only_compared: Whether the fit is only compared with others.
         other_start: (p,) another start, which is taken if it costs less.
     """
     task = search.task
@@ -563,8 +563,8 @@ def refit_task(
     begins = [_begin_near(problem, problem.begin(start), near) for start in starts]
     begin = begins[0] if len(begins) == 1 else min(begins, key=problem.cost)
     nearby = replace(search, begins_near=True)
-    found = nearby.solve(problem, begin, "near a similar fit", is_rough=is_rough)
-    if not is_rough:
+    found = nearby.solve(problem, begin, "near a similar fit", is_only_compared=is_only_compared)
+    if not is_only_compared:
         found = nearby.converged(*found)
     return FitResult(
         task=task,

@@ -356,7 +356,7 @@ class FitSearch:
         begin: UnknownValues,
         phase: str = "all data",
         *,
-        is_rough: bool = False,
+        is_only_compared: bool = False,
         is_first: bool = False,
         cost_to_beat: float = np.inf,
     ) -> tuple[FitProblem, Solution]:
@@ -366,7 +366,7 @@ class FitSearch:
             problem: The problem, with the stated noise.
             begin: Unknowns at the begin.
             phase: Name of the search in events.
-            is_rough: Whether the fit is only compared with others, so that few digits are enough.
+            is_only_compared: Whether the fit is only compared with others: few digits are enough.
             is_first: Whether searches from other starts follow where the fit misses the data. With
                 much data, it then ends near its minimum, and `converged` continues it.
             cost_to_beat: Cost of another fit with the stated noise. A search that cannot reach a
@@ -379,7 +379,7 @@ class FitSearch:
             SimulationDivergedError: The simulation diverges at the begin.
         """
         settings = self._settings(problem)
-        if is_rough:
+        if is_only_compared:
             settings = replace(
                 settings,
                 tolerance=FIRST_TOLERANCE,

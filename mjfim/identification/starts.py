@@ -550,7 +550,9 @@ def _estimates_over(
     name = "whole recordings" if length is None else f"segments of {length:.2g} s"
     begin = search.with_initial_states(problem, problem.begin(whole.theta))
     try:
-        weighted, solution = search.solve(problem, begin, f"comparison, {name}", is_rough=True)
+        weighted, solution = search.solve(
+            problem, begin, f"comparison, {name}", is_only_compared=True
+        )
     except SimulationDivergedError:
         return None
     estimates = [weighted.theta(solution.unknowns)]

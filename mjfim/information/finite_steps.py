@@ -58,7 +58,7 @@ LEAST_MEDIUM_FACTOR = 1.5
 # third step.
 SMOOTH_DECREASE = 6.0
 
-# A trajectory is rough if two derivatives differ by more than this number (relative).
+# Two derivatives disagree if they differ by more than this number (relative).
 DISAGREEMENT_TOLERANCE = 1e-2
 
 # The size of an output's derivative, to which a disagreement is related, is at least this fraction
@@ -82,7 +82,7 @@ def disagreement(fine: Array, coarse: Array) -> Array:
     return np.asarray(relative.max(axis=1))
 
 
-def is_rough(
+def steps_disagree(
     plant: Plant,
     noise: Noise,
     theta: Array,

@@ -244,7 +244,7 @@ class _Selector:
         begins_at_guess = settings.starts == 1 and settings.start != "inverse_dynamics"
         if settings.segment_length is None or not begins_at_guess or is_free:
             return fit_task(self._search(final), self.workers, checks_log=False)
-        return refit_task(self._search(final), result, self.workers, is_rough=False)
+        return refit_task(self._search(final), result, self.workers, is_only_compared=False)
 
     def _at_final_fit(self, model: FittedModel, result: FitResult, is_free: bool) -> FittedModel:
         """The model at its final fit, with the terms that only this fit shows.

@@ -13,8 +13,8 @@ import pytest
 from mjfim.excitation.task import DesignTask
 from mjfim.information.finite_steps import (
     disagreement,
-    is_rough,
     only_curved,
+    steps_disagree,
 )
 from mjfim.plant.plant import Derivatives
 from tests.support.numerics import Array, Loop, body_task, cart_task, filtered_task, make_task
@@ -74,7 +74,7 @@ def ball(folder: Path, horizon: float) -> DesignTask:
 
 def along(task: DesignTask) -> bool:
     """Roughness along the initial control."""
-    return is_rough(task.plant, task.system.noise, task.theta, task.initial)
+    return steps_disagree(task.plant, task.system.noise, task.theta, task.initial)
 
 
 @pytest.mark.parametrize(

@@ -34,7 +34,7 @@ from mjfim.excitation.search.descent import MU_FACTOR, Barrier
 from mjfim.excitation.search.inside import InsideControl, InsideSearch, is_progress
 from mjfim.excitation.search.levels import DescentLevel, coarser_levels, easier_level
 from mjfim.experiment.packing import for_workers
-from mjfim.information.finite_steps import is_rough
+from mjfim.information.finite_steps import steps_disagree
 from mjfim.parallel import (
     ExecutorLike,
     Workers,
@@ -214,7 +214,9 @@ class Search:
             climbed = yield from self._moved(free, self._free_rungs, is_last=True)
             found = {each.name: self._judged(each) for each in climbed}
             # What seems to be an optimum is none where derivatives mislead.
-            goes_on = self.budget.exhausted is None and begins_as_stated and self._is_rough
+            goes_on = (
+                self.budget.exhausted is None and begins_as_stated and self._derivatives_mislead
+            )
             done = [each for each in found.values() if not (each.has_left or goes_on)]
             left = {each.name for each in done}
             waiting = [
@@ -228,12 +230,12 @@ class Search:
                 # A control with few numbers improves quickly; on the next rung it is free.
                 waiting[0] = replace(waiting[0], curves=series.curves)
             # Where derivatives mislead and time is short, random changes come first.
-            is_rough = begins_as_stated and self._is_rough
-            is_short = is_rough and not self._has_time(evaluations=LADDER_EVALUATIONS)
+            is_misleading = begins_as_stated and self._derivatives_mislead
+            is_short = is_misleading and not self._has_time(evaluations=LADDER_EVALUATIONS)
             ladder = () if is_short else self._ladder(waiting)
             level = self.grounds.level(ladder[0].variant) if ladder else None
-            waiting[0] = yield from self._prepared(waiting[0], level, is_rough=is_rough)
-            if is_rough and not self._has_time(level):
+            waiting[0] = yield from self._prepared(waiting[0], level, is_misleading=is_misleading)
+            if is_misleading and not self._has_time(level):
                 return [*done, replace(waiting[0], status=Status.MAX_ITERATIONS)]
             done += yield from self._run_inside(waiting, ladder)
         return (yield from self._followed(done, further))
@@ -271,7 +273,7 @@ class Search:
         return first
 
     def _prepared(
-        self, first: Candidate, level: DescentLevel | None, *, is_rough: bool
+        self, first: Candidate, level: DescentLevel | None, *, is_misleading: bool
     ) -> Generator[DesignEvent, None, Candidate]:
         """The first candidate with a control within the limits, where one is found.
 
@@ -285,7 +287,7 @@ class Search:
         ground = self.grounds.ground(self.grounds.stated.task.system.variant, first)
         is_outside = not ground.is_near(first.control)
         share = 0.0
-        if is_rough:
+        if is_misleading:
             share = PROBE_SHARE if self._has_time(level) else CLOSING_SHARE
         elif is_outside and self._has_time(level):
             share = OUTSIDE_SHARE
@@ -563,7 +565,7 @@ class Search:
         return self.stage.task.experiment.descent.max_iterations
 
     @cached_property
-    def _is_rough(self) -> bool:
+    def _derivatives_mislead(self) -> bool:
         """Whether derivatives may mislead along the initial control."""
         task = self.stage.task
         if self.first.trajectory is None:
@@ -574,7 +576,7 @@ class Search:
         model = task.system.model_at(task.theta)
         if nothing_acts_along(model, self.first.trajectory, task.system.grid.substeps):
             return False
-        return is_rough(
+        return steps_disagree(
             task.plant,
             task.system.noise,
             task.theta,
