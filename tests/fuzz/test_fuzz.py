@@ -63,7 +63,11 @@ HIDDEN = (2, 19, 62, 113, 472)
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", HIDDEN)
-def test_a_hidden_feasible_motion_is_found(seed: int, tmp_path: Path) -> None:
+def test_a_hidden_feasible_motion_is_found(
+    seed: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # A case writes its description into the current folder.
+    monkeypatch.chdir(tmp_path)
     # Seconds of the processor, so that other programs on the computer do not shorten the search.
     with measured_by(time.process_time):
         outcome = problems.run(Case(kind="problem", seed=seed), tmp_path)
