@@ -163,7 +163,9 @@ def test_a_combination_that_no_recording_determines() -> None:
 def test_a_fit_names_the_odd_recording() -> None:
     """The friction of the third of five recordings of the cart-pendulum is 70 % larger."""
     control = {"kind": "multisine", "amplitude": 4.0, "frequency": 0.4, "harmonics": 6}
-    experiment = cart_pendulum(initial={"control": control}, horizon=1.5, fit={"bootstrap": 0})
+    experiment = cart_pendulum(
+        initial={"control": control}, horizon=1.5, fit={"bootstrap": 0, "segments": "whole"}
+    )
     rubbing = experiment.replace(parameters={"c": {"true": 1.7}})
     recordings = [
         replace(logs_of(rubbing if k == 2 else experiment, k)[0], name=f"logs/run_{k + 1}.csv")
