@@ -140,7 +140,7 @@ def test_a_failed_fit_over_the_chosen_length_is_said(monkeypatch: pytest.MonkeyP
 
     monkeypatch.setattr("mjfim.identification.starts._chosen", lambda _: 0)
     monkeypatch.setattr(FitSearch, "solve", failing)
-    found = mjfim.identify(stated(), log_with(0.6, 2))
+    found = mjfim.identify(stated(), log_with(0.6, 1))
     assert not found.horizons.is_used
     assert found.horizons.why_not_used == DIVERGED
     assert all(len(begins) == 1 for begins in found.segments)
