@@ -486,6 +486,13 @@ class FitSpec(Section):
             "fit predicts left-out data best."
         ),
     )
+    seconds: Seconds | None = Field(
+        default=None,
+        description=(
+            "Total length of the fitted segments [s], which are spread over the recordings. "
+            "Default: all segments."
+        ),
+    )
     hold: tuple[str, ...] = Field(
         default=(),
         description=(

@@ -18,7 +18,7 @@ import numpy as np
 from mjfim.arrays import Array
 from mjfim.errors import RecordingError, SimulationDivergedError
 from mjfim.experiment.system import System
-from mjfim.identification.aligned_recording import align, on_grid_of
+from mjfim.identification.aligned_recording import AlignedRecording, align, on_grid_of
 from mjfim.identification.fit_workers import FitWorkers, ProblemWork
 from mjfim.identification.segment_simulation import (
     DivergedSegmentError,
@@ -102,14 +102,8 @@ class FitProblem(SegmentSimulation):
         system = on_grid_of(system, recordings)
         aligned = tuple(align(system, recording) for recording in recordings)
 
-        # Difference steps suit the first samples of the longest recording: they depend on how
-        # strongly each parameter changes the recorded motion.
-        longest = max(aligned, key=lambda recording: len(recording.ctrl))
         samples = CALIBRATION_SAMPLES * stated_substeps // system.grid.substeps
-        nominal = system.plant.nominal_initial_state
-        begun = system.plant.with_initial_state(recorded_release(system, longest))
-        system = replace(system, plant=begun).calibrated(parameters.guess, longest.ctrl[:samples])
-        system = replace(system, plant=system.plant.with_initial_state(nominal))
+        system = with_suitable_differences(system, aligned, samples)
 
         # The initial states of segments are not stated; they come from the measured values.
         free_starts = has_free_starts(system)
@@ -454,6 +448,30 @@ class FitProblem(SegmentSimulation):
             if budget.exhausted is not None:
                 return
             yield work(self, budget)
+
+
+def with_suitable_differences(
+    system: System,
+    recordings: Sequence[AlignedRecording],
+    samples: int = CALIBRATION_SAMPLES,
+    wanted: np.ndarray | None = None,
+) -> System:
+    """A system with difference steps that suit the first samples of the longest recording.
+
+    They depend on how strongly each parameter changes the recorded motion.
+
+    Args:
+        system: The system.
+        recordings: The recordings.
+        samples: Largest number of these samples.
+        wanted: (p,) True for the parameters whose steps change; None for all.
+    """
+    longest = max(recordings, key=lambda recording: len(recording.ctrl))
+    nominal = system.plant.nominal_initial_state
+    begun = system.plant.with_initial_state(recorded_release(system, longest))
+    guess, ctrl = system.parameters.guess, longest.ctrl[:samples]
+    system = replace(system, plant=begun).calibrated(guess, ctrl, wanted)
+    return replace(system, plant=system.plant.with_initial_state(nominal))
 
 
 def _work_on_batch(

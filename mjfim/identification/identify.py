@@ -606,7 +606,10 @@ def _problems(task: FitTask, workers: FitWorkers | None) -> tuple[FitProblem, Fi
     problem = replace(task.problem(), workers=workers)
     if not task.held_out:
         return problem, None
-    return problem, replace(FitProblem.of(task.system, task.held_out), workers=workers)
+    held_out = FitProblem.of(task.system, task.held_out)
+    if task.predicts_whole:
+        held_out = held_out.cut(None) or held_out
+    return problem, replace(held_out, workers=workers)
 
 
 def least_squares(

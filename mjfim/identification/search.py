@@ -62,6 +62,8 @@ class FitTask:
         start: (p,) parameters at which the search starts, inside the bounds if the method has any
             [theta-unit].
         elsewhere: Recordings that do not begin at the stated initial state.
+        predicts_whole: Whether held-out recordings are predicted as a whole, although segments are
+            fitted.
     """
 
     system: System
@@ -70,6 +72,7 @@ class FitTask:
     method: Method
     start: Array
     elsewhere: tuple[OtherBegin, ...] = ()
+    predicts_whole: bool = False
 
     @classmethod
     def of(
@@ -140,7 +143,11 @@ class FitTask:
             RecordingError: There is no recording, or one cannot be used.
         """
         problem = FitProblem.of(self.system, self.recordings)
-        return replace(problem, bounded=self.method != "newton")
+        problem = replace(problem, bounded=self.method != "newton")
+        seconds = self.settings.seconds
+        if seconds is None:
+            return problem
+        return problem.of_segments(problem.spread(round(seconds / problem.system.dt), 1))
 
 
 def values_of_start(task: FitTask) -> str:
@@ -149,14 +156,17 @@ def values_of_start(task: FitTask) -> str:
     return listed([f"{n} = {v:.6g}" for n, v in zip(names, task.start, strict=True)])
 
 
-def with_length(task: FitTask, length: float | Literal["whole"] | None) -> FitTask:
+def with_length(
+    task: FitTask, length: float | Literal["whole"] | None, seconds: float | None = None
+) -> FitTask:
     """The task of fitting segments of a length.
 
     Args:
         task: The task.
         length: The length [s], or "whole"; None for a length that the fit chooses.
+        seconds: Total length of the segments that are fitted [s]; None for all.
     """
-    settings = task.settings.model_copy(update={"segments": length})
+    settings = task.settings.model_copy(update={"segments": length, "seconds": seconds})
     experiment = task.system.experiment.model_copy(update={"fit": settings})
     return replace(task, system=replace(task.system, experiment=experiment))
 
@@ -577,7 +587,7 @@ class FitSearch:
     def _has_much_data(self, problem: FitProblem) -> bool:
         """Whether one linearisation of a problem takes long."""
         samples = problem.sample_count * 2 * len(self.task.system.parameters)
-        return samples >= SAMPLES_OF_MUCH_DATA
+        return samples >= SAMPLES_OF_MUCH_DATA or self.task.settings.seconds is not None
 
     def _settings_of_part(self, part: FitProblem, rough_share: float) -> SearchSettings:
         """Settings of a search over a part of the data, before the search over all of them."""

@@ -12,7 +12,7 @@ initial velocity contains.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
@@ -341,18 +341,20 @@ def free_segments(
         length: About the length of a segment [s]; None for whole recordings.
 
     Returns:
-        The segments, and (nx, n) directions of a free initial state: all but the activations of
-        physical terms.
+        The segments, and (nx, n) `free_directions`.
 
     Raises:
         RecordingError: The segments are too short.
     """
-    space = system.space
-    known = [2 * space.nv + address for address in KnownActivations.of(system).addresses]
     duration = min(float(recording.t[-1]) for recording in recordings)
     lead = _max_delay(system.parameters, duration)
-    segments = cut_into_segments(system, recordings, length, lead)
-    return segments, np.delete(np.eye(space.nx), known, axis=1)
+    return cut_into_segments(system, recordings, length, lead), free_directions(system)
+
+
+def free_directions(system: System) -> Array:
+    """(nx, n) directions of a free initial state: all but the activations of physical terms."""
+    known = [2 * system.space.nv + address for address in KnownActivations.of(system).addresses]
+    return np.delete(np.eye(system.space.nx), known, axis=1)
 
 
 def whole_recordings(system: System, recordings: Sequence[AlignedRecording]) -> tuple[Segment, ...]:
@@ -500,12 +502,15 @@ def measured_initial_states(
     """
     space = system.space
     known = KnownActivations.of(system)
-    states = _nominal_states(system, recording, begins, known)
     output_of = measured_states(system, recording)
 
     quaternion_components = {a for q, _ in space.quaternions for a in range(q, q + 4)}
     velocity_addresses = (space.nq + space.scalar_v).tolist()
     velocity_of = dict(zip(space.scalar_q.tolist(), velocity_addresses, strict=True))
+    first = space.nq + space.nv
+    found = {*output_of, *(velocity_of[q] for q in output_of if q in velocity_of)}
+    found |= {first + address for address in known.addresses}
+    states = _nominal_states(system, recording, begins, found)
 
     for k, begin in enumerate(begins):
         t0 = begin * recording.dt
@@ -557,20 +562,19 @@ def _local_fit(
 
 
 def _nominal_states(
-    system: System, recording: AlignedRecording, begins: np.ndarray, known: KnownActivations
+    system: System, recording: AlignedRecording, begins: np.ndarray, found: Collection[int]
 ) -> Array:
     """(n, ns) states of the model at the guess, simulated from the stated initial state.
 
-    Where the model diverges, all of them are the initial state.
+    Components at the addresses `found` are replaced later. Where the model diverges, all of them
+    are the initial state.
     """
     start = system.plant.initial_state(system.parameters.guess)
     states = np.tile(start, (len(begins), 1))
 
-    # No simulation is needed where the whole state is measured, or where all segments begin at the
+    # No simulation is needed where the whole state is found, or where all segments begin at the
     # first sample.
-    first = system.space.nq + system.space.nv
-    measured = {*measured_states(system, recording), *(first + a for a in known.addresses)}
-    if measured.issuperset(range(len(start))) or not begins.any():
+    if set(range(len(start))) <= {*found} or not begins.any():
         return states
 
     model = system.plant.model(system.parameters.guess)

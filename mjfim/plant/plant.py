@@ -540,7 +540,8 @@ class Plant(Dynamics):
         Args:
             theta: (p,) parameters of the trajectory [theta-unit].
             trajectory: Trajectory on which the effect of every parameter is measured.
-            wanted: (p,) True for the parameters whose effect is measured; None for all.
+            wanted: (p,) True for the parameters whose effect is measured; None for all. The others
+                keep their steps.
 
         Returns:
             The plant with longer difference steps for parameters that hardly move this trajectory,
@@ -563,7 +564,10 @@ class Plant(Dynamics):
 
         effects = self._effects(trajectory, *measured)
         factors = np.clip(MIN_PARAMETER_EFFECT / np.maximum(effects, TINY), 1.0, MAX_STEP_FACTOR)
-        return self.with_step_factors(factors if wanted is None else np.where(wanted, factors, 1.0))
+        if wanted is not None:
+            kept = 1.0 if self.step_factors is None else self.step_factors
+            factors = np.where(wanted, factors, kept)
+        return self.with_step_factors(factors)
 
     def _effects(self, trajectory: Trajectory, y: Array, sensitivity: Sensitivity) -> Array:
         """(p,) largest effects of the parameters on states and sensors, relative to their sizes.

@@ -66,6 +66,11 @@ MAX_HELD_ATTEMPTS = 8
 # data are too few for a clear difference.
 WORSE_ERROR_RATIO = 1.02
 
+# Engine steps of one linearisation, above which terms are chosen on segments spread over the
+# recordings, and the least number of these segments. A selection makes a hundred linearisations.
+MAX_STEPS = 100_000
+MIN_SEGMENTS = 20
+
 # Largest number of final fits, each of which may show further terms.
 MAX_FINAL_FITS = 3
 
@@ -149,6 +154,7 @@ class _Selector:
     max_terms: int
     steps: list[SelectionStep] = field(default_factory=list)
     ending: str = ""
+    remark: str = ""
     first: FittedModel = field(init=False)
 
     def selected(self, task: FitTask) -> Estimate:
@@ -160,6 +166,7 @@ class _Selector:
         Args:
             task: The fit of the stated model.
         """
+        task = self._affordable(task)
         is_free = task.settings.segments is None
         result = fit_task(
             self._search(with_length(task, "whole") if is_free else task), self.workers
@@ -182,6 +189,24 @@ class _Selector:
                 break
         return self._selected(model, is_free)
 
+    def _affordable(self, task: FitTask) -> FitTask:
+        """The task on as many segments, spread over the recordings, as a selection can fit."""
+        problem = task.problem()
+        simulations = 1 + problem.column_count + problem.private_count
+        samples = MAX_STEPS // (simulations * problem.system.grid.substeps)
+        if problem.sample_count <= samples:
+            return task
+        dt, whole = problem.system.dt, problem.sample_count
+        seconds, length = samples * dt, task.settings.segment_length
+        task = with_length(task, length or seconds / MIN_SEGMENTS, seconds)
+        task = replace(task, predicts_whole=length is None)
+        problem = task.problem()
+        self.remark = (
+            f"only {len(problem.segments)} segments, {problem.sample_count * dt:.3g} of "
+            f"{whole * dt:.3g} s, were fitted; fit the selected model to all data"
+        )
+        return task
+
     def _selected(self, model: FittedModel, is_free: bool) -> Estimate:
         """Estimate of the chosen model."""
         # The fit is reported as one that began at the guess.
@@ -193,6 +218,8 @@ class _Selector:
         selection = self._selection(model)
         tests = None if result.quality.unexplained or self._is_stopped() else model.tests
         estimate = estimate_from(result, self.budget, selection.refuted, tests)
+        if self.remark:
+            estimate = replace(estimate, warnings=(self.remark, *estimate.warnings))
         if selection.is_changed:
             settings = result.task.settings
             selection = replace(
@@ -234,7 +261,12 @@ class _Selector:
         is_settled = not is_changed and not (is_free and is_doubtful(result))
         if is_settled or self._is_stopped():
             return result
-        final = replace(result.task, start=result.theta, held_out=self.held_out)
+        final = replace(
+            result.task,
+            start=result.theta,
+            held_out=self.held_out,
+            predicts_whole=self.first.result.task.predicts_whole,
+        )
         if is_free:
             final = with_length(final, None)
 
@@ -320,9 +352,7 @@ class _Selector:
                 return model
             begin_stage(f"looking for term {len(model.terms) + 1} that the model lacks")
             result = model.result
-            tests = model.tests or find_missing_terms(
-                result.problem, result.task.recordings, result.solution.unknowns
-            )
+            tests = model.tests or find_missing_terms(result.problem, result.solution.unknowns)
             model = replace(model, tests=tests)
             candidates = tests.without(refuted).terms
             if not candidates:

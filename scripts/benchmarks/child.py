@@ -46,13 +46,12 @@ def options_of(description: str | None, runs: int = 0) -> argparse.ArgumentParse
     return parser
 
 
-def paths_of(description: str | None) -> tuple[Path, Path, Path]:
-    """Data, model in MJCF, and the folder of the output, which is made."""
-    parser = options_of(description)
+def with_paths(parser: argparse.ArgumentParser) -> argparse.Namespace:
+    """Parsed arguments with data, model in MJCF, and the folder of the output, which is made."""
     parser.add_argument("paths", type=Path, nargs=3, help="data, model in MJCF, output")
-    data, model, output = parser.parse_args().paths
-    output.mkdir(parents=True, exist_ok=True)
-    return data, model, output
+    args = parser.parse_args()
+    args.paths[-1].mkdir(parents=True, exist_ok=True)
+    return args
 
 
 def write_log(path: Path, names: Sequence[str], *columns: ArrayLike, form: str = "%.6f") -> None:

@@ -22,7 +22,7 @@ import mjfim
 from mjfim.arrays import Array
 from mjfim.experiment.system import System
 from mjfim.recordings.read import read_recording
-from scripts.benchmarks.child import new_table, overlap, paths_of, rms, write_log
+from scripts.benchmarks.child import new_table, options_of, overlap, rms, with_paths, write_log
 
 LEGS = ("FL", "FR", "RL", "RR")
 KINDS = ("hip", "thigh", "calf")
@@ -224,7 +224,7 @@ def apart(*found: dict[str, tuple[float, Array]]) -> str:
 
 def main() -> int:
     """Fit and predict all legs, and print what was found."""
-    data, model, output = paths_of(__doc__)
+    data, model, output = with_paths(options_of(__doc__)).paths
     log = np.genfromtxt(data / "traj_0.csv.gz", delimiter=",", names=True)
     every = [f"{leg}_{kind}" for leg in LEGS for kind in KINDS]
     angles, references = (

@@ -1,17 +1,22 @@
 """A real SO-101 arm: five motions are fitted in part, all are predicted beside published sets.
 
     python -m scripts.benchmarks so101 DATA/sage_so101 MODEL/so101_nomesh.xml out/so101
+    python -m scripts.benchmarks so101 DATA/sage_so101 MODEL/so101_nomesh.xml out/so101 --select
 
 The folder of the data holds one folder for each motion, with position references and measured
 angles. The script writes model, experiment file and logs into the folder of the output, and prints
 the rms error of every motion, open loop from the references. Published sets have the best delay of
 0 to 60 ms and no contacts.
+
+With `--select`, the model lacks the gain kd and the drag. Terms are selected from five whole
+motions, and the other five are predicted.
 """
 
 from __future__ import annotations
 
 import gzip
 import json
+import re
 import time
 from pathlib import Path
 
@@ -24,7 +29,7 @@ import mjfim
 from mjfim.arrays import Array
 from mjfim.experiment.system import System
 from mjfim.recordings.read import read_recording
-from scripts.benchmarks.child import new_table, paths_of, rms, write_log
+from scripts.benchmarks.child import new_table, options_of, rms, with_paths, write_log
 
 JOINTS = ["shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll", "gripper"]
 
@@ -179,7 +184,10 @@ def numbers_of(row: str) -> Array:
 
 def main() -> int:
     """Fit, predict, and print the errors of all motions."""
-    data, model, output = paths_of(__doc__)
+    parser = options_of(__doc__)
+    parser.add_argument("--select", action="store_true", help="select terms from whole motions")
+    args = with_paths(parser)
+    data, model, output = args.paths
     text = model.read_text(encoding="utf-8")
     for change in CHANGES.items():
         text = text.replace(*change)
@@ -200,6 +208,9 @@ def main() -> int:
     tables = ARM + outputs + SHARED + laws
     for name, paths in shared.items():
         tables = tables.replace(f"[{name}]", f"[{paths}]")
+    if args.select:
+        tables = re.sub(r"\[parameters\.(kd|drag_\w+)\]\n(\w.*\n)*", "", tables)
+        tables = re.sub(r"(?m)^(kd|reference_velocity) = .*\n", "", tables)
     (output / "so101.toml").write_text(tables, encoding="utf-8")
     experiment = mjfim.Experiment.from_file(output / "so101.toml")
 
@@ -214,10 +225,18 @@ def main() -> int:
         return read_recording(log, channels)
 
     begun = time.perf_counter()
-    fitted = [recording(name, slice(*rows)) for name, rows in FITTED.items()]
-    held_out = [recording(name, slice(None)) for name in motions]
-    found = mjfim.identify(experiment, fitted, held_out=held_out)
     console = Console(width=200)
+    if args.select:
+        fitted = [recording(name, slice(None)) for name in FITTED]
+        motions = {name: motions[name] for name in HELD_OUT.split()}
+    else:
+        fitted = [recording(name, slice(*rows)) for name, rows in FITTED.items()]
+    held_out = [recording(name, slice(None)) for name in motions]
+    if args.select:
+        found = mjfim.select_terms(experiment, fitted, held_out=held_out)
+        console.print(f"{found.selection} {found.warnings[0]}")
+    else:
+        found = mjfim.identify(experiment, fitted, held_out=held_out)
     console.print(dict(zip(found.parameters, found.theta.tolist(), strict=True)))
     console.print(f"{(time.perf_counter() - begun) / 60.0:.1f} minutes")
 
@@ -228,6 +247,8 @@ def main() -> int:
         theirs = [published_rms(model, each, motion) for each in PUBLISHED.values()]
         table.add_row(name, *(f"{each:.1f}" for each in (rms(errors), *rms(errors, 0), *theirs)))
     console.print(table)
+    if args.select:
+        return 0
 
     # Ratios that the motions determine. Torques have no scale without a load, so that sets with
     # other gains may move alike. Intervals are those of the numerators.

@@ -202,7 +202,7 @@ def test_numbers_of_a_driver_are_missing_terms(name: str, change: float) -> None
     at = least_squares(problem, problem.system.parameters.guess).unknowns
 
     # A filter and a latency of the same delay explain the data about equally well.
-    likely = {term.path: term for term in find_missing_terms(problem, [log], at).likely}
+    likely = {term.path: term for term in find_missing_terms(problem, at).likely}
     found = likely[f"controller/elbow:{name}"]
     assert found.main.value == pytest.approx(change, rel=0.3)
     assert found.share > 0.97
@@ -235,7 +235,7 @@ def test_terms_that_a_model_cannot_have_are_named(integrator: str, tmp_path: Pat
     system = System.resolve(experiment)
     log = recorded(system, 2.0 * np.sin(0.1 * np.arange(300))[:, None])
     problem = FitProblem.of(system, [log])
-    tests = find_missing_terms(problem, [log], problem.begin(system.parameters.guess))
+    tests = find_missing_terms(problem, problem.begin(system.parameters.guess))
     assert list(tests.data.impossible) == words
     assert words[0] in tests.remark
     assert words[0] in str(tests.data.summary()["impossible"])

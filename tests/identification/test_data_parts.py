@@ -16,8 +16,9 @@ from mjfim.identification.assessment.term_tests import (
     part_of_data,
 )
 from mjfim.identification.fit_problem import FitProblem
-from mjfim.identification.search import of_subset
+from mjfim.identification.search import FitTask, of_subset
 from mjfim.records.terms import TermTestData
+from mjfim.studies import selection
 from tests.identification.test_missing_terms import with_failing
 from tests.support.terms import (
     experiment_of,
@@ -76,6 +77,19 @@ def test_too_many_recordings_are_not_cut_into_crumbs(
     assert part.sample_count == 100
 
 
+def test_a_fit_to_some_seconds_has_segments_of_all_recordings(tmp_path: Path) -> None:
+    fit = {"bootstrap": 0, "segments": 0.25, "seconds": 1.5}
+    experiment = experiment_of(tmp_path, "tilt", fit=fit)
+    system = System.resolve(experiment)
+    logs = [recorded(system, motor_torque(2.0, RATE, seed), seed) for seed in range(3)]
+    segments = FitTask.of(system, logs).problem().segments
+    assert {segment.recording for segment in segments} == {0, 1, 2}
+    assert sum(segment.samples for segment in segments) == 1.5 * RATE
+
+    low, high = mjfim.identify(experiment, logs).interval.T
+    assert ((low < system.parameters.true) & (system.parameters.true < high)).all()
+
+
 def test_what_was_not_tested_is_said() -> None:
     for share, recordings, count, untested, words in (
         (1.0, 4, 4, (), ""),
@@ -105,3 +119,8 @@ def test_an_estimate_and_a_selection_say_on_how_much_terms_were_tested(
     assert ending.startswith(f"No further term that was tested is significant. {words}")
     assert ending.endswith("cannot have it: a strange spring.")
     assert any("a strange spring" in sentence for sentence in found.warnings)
+
+    # Of much data, segments are fitted that are spread over them.
+    monkeypatch.setattr(selection, "MAX_STEPS", 2_000)
+    found = mjfim.select_terms(experiment, logs)
+    assert found.warnings[0].startswith("only 20 segments, 1")

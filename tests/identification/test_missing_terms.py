@@ -49,7 +49,7 @@ def test_a_small_term_that_matters_is_found_in_much_data() -> None:
         """Tests of a log in which a constant force acts that the control does not show."""
         log = replace(recorded(system, ctrl + force, seed), ctrl=ctrl)
         problem = FitTask.of(system, [log]).problem()
-        return find_missing_terms(problem, [log], problem.begin(system.parameters.true))
+        return find_missing_terms(problem, problem.begin(system.parameters.true))
 
     def tilt(tests: TermTests) -> float:
         """Its deviation from zero, in standard deviations; 0 where it is not significant."""
@@ -100,7 +100,7 @@ def test_the_move_by_an_unseen_term_is_that_of_least_squares(
 
     log = recorded(system, ctrl, theta=theta, share=1e-3)
     problem = FitTask.of(system, [log]).problem()
-    data = find_missing_terms(problem, [log], problem.begin(theta)).data
+    data = find_missing_terms(problem, problem.begin(theta)).data
     assert data.unseen
     for name, (share, words) in data.unseen:
         assert words == "a tilt of the base along x"
@@ -113,7 +113,7 @@ def test_a_term_for_which_a_parameter_stands_moves_nothing() -> None:
     task = fit_of(stated(horizon=4.0), 0)
     problem = task.problem()
     at = problem.begin(task.system.parameters.true)
-    assert "payload" not in find_missing_terms(problem, task.recordings, at).data.unseen_sentence
+    assert "payload" not in find_missing_terms(problem, at).data.unseen_sentence
 
 
 @pytest.mark.slow
@@ -161,12 +161,12 @@ def test_a_candidate_that_diverges_or_is_invalid_is_named_and_hides_no_other(
     task = FitTask.of(System.resolve(stated, threads=1), [rubbing_pendulum(tmp_path)])
     problem = task.problem()
     at = problem.begin(task.start)
-    usual = find_missing_terms(problem, task.recordings, at)
+    usual = find_missing_terms(problem, at)
     assert not usual.data.untested
     assert "joint/pivot:frictionloss" in {term.path for term in usual.terms}
 
     with_failing(path, monkeypatch)
-    found = find_missing_terms(problem, task.recordings, at)
+    found = find_missing_terms(problem, at)
     assert found.data.untested == ("a strange spring",)
     assert [term.path for term in found.terms] == [term.path for term in usual.terms]
     assert found.remark.endswith("cannot have it: a strange spring.")

@@ -121,7 +121,7 @@ def search(method: str = "least_squares", *, noise_is_stated: bool = True) -> An
     task: Any = SimpleNamespace(
         method=method,
         noise_is_stated=noise_is_stated,
-        settings=SimpleNamespace(max_iterations=60, starts=1, loss="linear"),
+        settings=SimpleNamespace(max_iterations=60, starts=1, loss="linear", seconds=None),
         system=SimpleNamespace(parameters=["slope"], noise=SimpleNamespace(sigma=np.ones(1))),
     )
     return FitSearch(task=task, budget=Budget(), callback=None)

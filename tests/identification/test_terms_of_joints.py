@@ -86,7 +86,7 @@ def term_tests(experiment: mjfim.Experiment, log: Recording) -> TermTests:
     """Tests of the terms that the stated model lacks."""
     system = System.resolve(experiment, threads=1)
     problem = FitProblem.of(system, [log])
-    return find_missing_terms(problem, [log], solution_near(problem, system.parameters.guess))
+    return find_missing_terms(problem, solution_near(problem, system.parameters.guess))
 
 
 @pytest.mark.slow

@@ -120,7 +120,7 @@ def estimate_from(
             if is_larger and are_white(quality.whiteness):
                 seen = quality.chi2 / quality.dof * noise.covariance
                 tested = problem.with_noise(Noise(covariance=seen, strides=noise.strides))
-            found = find_missing_terms(tested, task.recordings, solution.unknowns)
+            found = find_missing_terms(tested, solution.unknowns)
             tests = TermTests() if budget.stop.requested else found
     tests = tests.without(refuted or ())
     predictions = _predictions(result, budget)

@@ -29,14 +29,18 @@ from mjfim.identification.assessment.term_candidates import (
     Candidate,
     candidates_of,
 )
-from mjfim.identification.fit_problem import FitProblem
+from mjfim.identification.fit_problem import FitProblem, with_suitable_differences
 from mjfim.identification.search import of_subset
-from mjfim.identification.segments import KnownActivations, Segment, spread_over_data
+from mjfim.identification.segments import (
+    KnownActivations,
+    Segment,
+    free_directions,
+    spread_over_data,
+)
 from mjfim.model.coordinates import state_names, tangent_names
 from mjfim.model.elements import free_name
 from mjfim.optimize.levenberg_marquardt import UnknownValues
 from mjfim.records.terms import Term, TermNumber, TermTestData
-from mjfim.records.trajectory import Recording
 
 # Number of samples of a segment that tell enough. Where the part would contain fewer of each
 # recording, it contains fewer recordings.
@@ -45,7 +49,6 @@ ENOUGH_SAMPLES = 500
 
 def extended_problem(
     problem: FitProblem,
-    recordings: Sequence[Recording],
     at: UnknownValues,
     parameters: dict[str, Any],
     tables: dict[str, Any],
@@ -57,7 +60,6 @@ def extended_problem(
 
     Args:
         problem: The problem of some segments of the stated system.
-        recordings: All recordings.
         at: Its solution.
         parameters: Tables of the further parameters by name.
         tables: Tables of the library of terms by name.
@@ -74,25 +76,33 @@ def extended_problem(
         )
     except (ExperimentError, ModelError):
         return None
-    names = extended.parameters.names
-    theta = np.array(extended.parameters.guess)
-    theta[[names.index(name) for name in system.parameters.names]] = at.theta
+    extended = extended.with_substeps(system.grid.substeps)
+    parameters_of_both, plant = extended.parameters, extended.plant
+    names = parameters_of_both.names
+    places = [names.index(name) for name in system.parameters.names]
+    theta, factors = np.array(parameters_of_both.guess), np.ones(len(names))
+    theta[places] = at.theta
+    if system.plant.step_factors is not None:
+        factors[places] = system.plant.step_factors
+    extended = replace(extended, plant=plant.with_step_factors(factors))
 
     # The rows are those of the solution; a delay as a parameter would let the segments begin
     # earlier.
-    wider: FitProblem | None = FitProblem.of(extended, recordings)
-    if wider is not None and problem.free_starts and not wider.free_starts:
-        wider = wider.cut(None)
-    if wider is None:
-        return None
+    is_new = ~np.isin(np.arange(len(names)), places)
+    directions = plant.initial_state_derivative[:, parameters_of_both.initial_deviations]
+    if problem.free_starts:
+        directions = free_directions(extended)
     wider = replace(
-        wider,
-        segments=_extended_segments(problem, wider),
-        masks=problem.masks,
-        noise=problem.noise,
-        difference_step=problem.difference_step,
-        central=problem.central,
-        workers=problem.workers,
+        problem,
+        system=extended,
+        segments=_extended_segments(problem, extended),
+        start_directions=directions,
+        parameters=parameters_of_both,
+        shared=np.sort([*np.flatnonzero(is_new), *(places[j] for j in problem.shared)]),
+        bounded=True,
+        with_priors=True,
+        pins=np.zeros((0, len(names))),
+        pinned_at=parameters_of_both.guess,
     )
     # Private unknowns of new coordinates are zero.
     before, after = _private_names(problem), _private_names(wider)
@@ -101,9 +111,8 @@ def extended_problem(
     return wider, replace(at, theta=theta, private=private)
 
 
-def _extended_segments(problem: FitProblem, wider: FitProblem) -> tuple[Segment, ...]:
-    """The segments of a problem with initial states of the extended model."""
-    system = wider.system
+def _extended_segments(problem: FitProblem, system: System) -> tuple[Segment, ...]:
+    """The segments of a problem with initial states of the extended system."""
     space = system.space
     known = KnownActivations.of(system)
     stated = state_names(problem.system.model)
@@ -121,7 +130,7 @@ def _extended_segments(problem: FitProblem, wider: FitProblem) -> tuple[Segment,
         start[common] = segment.start
         qvel = space.split(start)[1]
         values = known.at(
-            wider.recordings[segment.recording], np.array([segment.begin]), qvel[None]
+            problem.recordings[segment.recording], np.array([segment.begin]), qvel[None]
         )[0]
         start[places[is_added]] = values[is_added]
         segments.append(replace(segment, start=start))
@@ -276,14 +285,11 @@ class TermTests:
         return "".join(f" {sentence}" for sentence in sentences if sentence)
 
 
-def find_missing_terms(
-    problem: FitProblem, recordings: Sequence[Recording], at: UnknownValues
-) -> TermTests:
+def find_missing_terms(problem: FitProblem, at: UnknownValues) -> TermTests:
     """Terms that would explain significant residuals.
 
     Args:
         problem: The least-squares problem of the estimate.
-        recordings: Its recordings.
         at: Its solution.
 
     Returns:
@@ -307,7 +313,6 @@ def find_missing_terms(
     at = of_subset(at, segments)
     search = _TermSearch(
         problem=part,
-        recordings=recordings,
         at=at,
         squares=2.0 * part.cost(at),
         count=sum(len(group) for group in groups),
@@ -442,14 +447,12 @@ class _TermSearch:
 
     Attributes:
         problem: The least-squares problem.
-        recordings: Its recordings.
         at: Its solution.
         count: Number of candidates with score tests.
         squares: Sum of squared residuals at the solution.
     """
 
     problem: FitProblem
-    recordings: Sequence[Recording]
     at: UnknownValues
     count: int
     squares: float
@@ -549,10 +552,13 @@ class _TermSearch:
                     "guess": number.begin,
                     "scale": number.size,
                 }
-        extended = extended_problem(self.problem, self.recordings, self.at, parameters, tables)
+        extended = extended_problem(self.problem, self.at, parameters, tables)
         if extended is None:
             return None
         wider, begin = extended
+        is_new = np.isin(wider.parameters.names, list(parameters))
+        system = with_suitable_differences(wider.system, wider.recordings, wanted=is_new)
+        wider = replace(wider, system=system)
         # Even the smallest size of a term may change the residuals. The readings follow it.
         before, after = self.problem.predict(self.at), wider.predict(begin)
         if before is None or after is None:
@@ -679,7 +685,7 @@ class _TermSearch:
         """A term with its best value; None where no value is better than none."""
         (tested,) = candidate.tested
         extended = extended_problem(
-            self.problem, self.recordings, self.at, {"?": {"target": tested.path}}, candidate.tables
+            self.problem, self.at, {"?": {"target": tested.path}}, candidate.tables
         )
         if extended is None:
             return None
