@@ -328,6 +328,9 @@ class _Selector:
     def _chosen(self, model: FittedModel) -> FittedModel:
         """Add terms, remove needless ones, and simplify the parameters."""
         model = self._pruned(self._grown(model))
+        if self.remark:
+            # What segments of long logs hardly determine may be clear in all of them.
+            return model
         simpler = self._simplified(model)
         # Terms may have stood in for parameters that are held or pooled now. Without them, others
         # may be significant that were not tried before.
