@@ -122,11 +122,7 @@ SETUPS = {
         folder, nuisance={"initial": {"qvel:ball.ry": True}}
     ),
     "bias and delay unknown": cart(nuisance={"bias": True, "delay": True}, cost={"criterion": "D"}),
-    "delay wanted": cart(
-        parameters={**CART_PARAMETERS, "lag": {"target": "output:delay", "guess": 0.013}},
-        noise=SENSED,
-    ),
-    "scales wanted": cart(
+    "scales and delay wanted": cart(
         parameters={
             **CART_PARAMETERS,
             "angle": {"target": "output/angle:scale", "guess": 0.1},
@@ -139,7 +135,6 @@ SETUPS = {
         "implicitfast", noise=SENSED, nuisance=LATE, cost={"criterion": "A"}
     ),
     "servo of unknown gain": servo,
-    "correlated noise": cart(noise=SENSED, correlated=CORRELATED),
     "correlated noise, nuisances": cart(
         noise=SENSED, correlated=CORRELATED, nuisance=LATE, measure_rate=50.0
     ),

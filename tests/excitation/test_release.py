@@ -233,9 +233,13 @@ def test_every_verb_follows_the_designed_release(tmp_path: Path) -> None:
     file, log, out = tmp_path / "swing.toml", tmp_path / "log.csv", tmp_path / "out"
     file.write_text(FILE, encoding="utf-8")
     for arguments in (
+        ("list", tmp_path / "swing_down.xml"),
         ("validate", file),
+        ("check", file, "-o", tmp_path / "check"),
+        ("simulate", file, "-o", tmp_path / "initial.csv"),
         ("design", file, "-o", out),
         ("simulate", file, out, "-o", log),
+        ("check", file, log),
         ("identify", file, log, "-o", tmp_path / "fit"),
         ("check", file, "--design", out),
         ("montecarlo", file, out, "-o", tmp_path / "study", "--trials", "4"),
@@ -244,5 +248,9 @@ def test_every_verb_follows_the_designed_release(tmp_path: Path) -> None:
     ):
         result = run(*arguments)
         assert result.exit_code == 0, result.output
-    angle = float(log.read_text(encoding="utf-8").splitlines()[1].split(",")[1])
+    assert (tmp_path / "fit" / "identified.xml").is_file()
+    # There is no column of a control.
+    header, row, *_ = log.read_text(encoding="utf-8").splitlines()
+    assert header == '"t","qpos:hinge"'
+    angle = float(row.split(",")[1])
     assert abs(angle) == pytest.approx(np.deg2rad(120.0), abs=0.02)

@@ -21,7 +21,7 @@ from mjfim.errors import RecordingError
 from mjfim.excitation.design import design_task
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.system import simulate_system
-from mjfim.files import PREFIX, as_json, remove_temporary_files, replacing
+from mjfim.files import PREFIX, as_json, replacing
 from mjfim.output import archive
 from mjfim.output.plots import draw
 from mjfim.output.rerun import log_design
@@ -245,13 +245,6 @@ def test_files_of_killed_processes_are_removed_and_new_ones_stay(tmp_path: Path)
     with replacing(tmp_path / "x.json") as temporary:
         assert temporary.name.startswith(PREFIX)
     assert {path.name for path in tmp_path.iterdir()} == {"x.json", *kept}
-
-
-def test_a_process_that_has_to_end_at_once_leaves_no_temporary_file(tmp_path: Path) -> None:
-    with replacing(tmp_path / "x.json") as temporary:
-        remove_temporary_files()
-        assert not any(tmp_path.iterdir())
-        temporary.touch()
 
 
 def half_written(*args: Any, **kwargs: Any) -> None:

@@ -36,18 +36,6 @@ def cart(**tables: Any) -> DesignTask:
     return DesignTask.resolve(Experiment.from_file(CART).model_copy(update=tables))
 
 
-def noiseless(task: DesignTask, theta: Array | None = None) -> Recording:
-    """Outputs of the initial control without noise, at the true values."""
-    values = task.parameters.true if theta is None else theta
-    y, _ = task.plant.measure(values[None], task.control)
-    return Recording(
-        t=np.arange(len(y[0])) * task.dt,
-        ctrl=task.control,
-        y=y[0],
-        outputs=task.system.outputs.names,
-    )
-
-
 def residual(problem: SysidProblem, theta: Array) -> Array:
     """All residuals in one row."""
     with silenced():
@@ -131,7 +119,7 @@ def test_sysid_gets_the_same_model_data_and_weights(case: str, tmp_path: Path) -
 def test_what_sysid_cannot_fit_is_refused(tables: dict[str, Any], said: str) -> None:
     task = DesignTask.resolve(Experiment.from_file(CART).replace(**tables))
     with pytest.raises(ExperimentError, match=said):
-        sysid_problem(task.system, [noiseless(task)])
+        sysid_problem(task.system, [simulate_system(task.system, task.initial, 1)])
 
 
 def test_without_the_extra_it_says_how_to_get_it(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -134,13 +134,6 @@ def test_segments_of_a_recording_have_its_bias_in_common(tmp_path) -> None:
     assert_allclose(stds[1], stds[0], rtol=1e-6)
 
 
-def test_a_given_trajectory_is_checked_instead_of_the_initial_one(tmp_path) -> None:
-    task = cart_task(tmp_path)
-    other = task.plant.simulate(task.theta, 2.0 * task.control)
-    stds = [row.std for row in check_task(task, trajectory=other).rows]
-    assert_allclose(stds, evaluate_task(task, other).std, rtol=1e-6)
-
-
 def test_dry_friction_says_why_the_derivatives_do_not_agree(tmp_path) -> None:
     parameters = {
         "mass": {"target": "body/block:mass"},

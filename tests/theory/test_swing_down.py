@@ -11,7 +11,6 @@ from numpy.testing import assert_allclose
 import mjfim
 from mjfim.errors import ExperimentError
 from mjfim.excitation.task import DesignTask
-from tests.support.cli import run
 from tests.support.swing_down import (
     CENTRE,
     DAMPING,
@@ -40,37 +39,6 @@ def test_a_check_predicts_the_standard_deviations_of_the_closed_form(tmp_path: P
     assert_allclose(predicted, np.sqrt(np.diag(np.linalg.inv(theory))), rtol=2e-3)
     assert found.self_test.passed
     assert found.source == "the initial state"
-
-
-FILE = """
-model = "swing_down.xml"
-rate = 50.0
-horizon = 3.0
-initial.qpos = [0.5]
-parameters.damping = { target = "joint/hinge:damping", guess = 0.02, true = 0.01 }
-parameters.centre = { target = "body/rod:ipos[2]", guess = -0.25, true = -0.3 }
-noise = { "qpos:hinge" = 0.002 }
-"""
-
-
-@pytest.mark.slow
-@pytest.mark.usefixtures("empty_figures")
-def test_every_verb_works_without_columns_of_controls(tmp_path: Path) -> None:
-    swing_down(tmp_path)
-    file, log, out = tmp_path / "swing.toml", tmp_path / "log.csv", tmp_path / "out"
-    file.write_text(FILE, encoding="utf-8")
-    for arguments in (
-        ("list", tmp_path / "swing_down.xml"),
-        ("validate", file),
-        ("check", file, "-o", tmp_path / "check"),
-        ("simulate", file, "-o", log),
-        ("check", file, log),
-        ("identify", file, log, "-o", out),
-    ):
-        result = run(*arguments)
-        assert result.exit_code == 0, result.output
-    assert log.read_text(encoding="utf-8").splitlines()[0] == '"t","qpos:hinge"'
-    assert (out / "identified.xml").exists()
 
 
 def test_a_control_for_no_actuators_is_an_error(tmp_path: Path) -> None:
