@@ -37,17 +37,12 @@ def body(tmp_path_factory: pytest.TempPathFactory) -> DesignTask:
     return body_task(tmp_path_factory.mktemp("body"), noise={"state": 0.01})
 
 
-def reference(t: Array, ctrl: Array, edges: Array) -> Array:
-    """Integral of the held control up to each edge; beyond the end, the last value is held."""
-    begins, ends = t[:-1], np.append(t[1:-1], np.inf)
-    return (np.clip(edges[:, None], begins, ends) - begins) @ ctrl
-
-
 @pytest.mark.parametrize("mean", [0.11 * DT, DT, 2.3 * DT, 17.0 * DT])
 def test_every_sample_holds_the_mean_of_the_control(mean: float) -> None:
     """The integral of the control from the first row to any sample is that of the recording.
 
-    Rows are at random times, some of them close together, with gaps.
+    Rows are at random times, some of them close together, with gaps. Beyond the end, the last value
+    is held.
     """
     rng = np.random.default_rng(round(mean / DT * 100))
     for _ in range(60):
@@ -58,8 +53,9 @@ def test_every_sample_holds_the_mean_of_the_control(mean: float) -> None:
         edges = np.arange(len(found) + 1) * DT
         assert edges[-1] >= t[-1] - 0.01 * DT
         assert len(found) == 1 or edges[-2] < t[-1]
-        integral = np.cumsum(found, axis=0) * DT
-        assert_allclose(integral, reference(t, ctrl, edges[1:]), rtol=1e-10)
+        begins, ends = t[:-1], np.append(t[1:-1], np.inf)
+        expected = (np.clip(edges[1:, None], begins, ends) - begins) @ ctrl
+        assert_allclose(np.cumsum(found, axis=0) * DT, expected, rtol=1e-10)
 
 
 def test_control_on_the_grid_is_unchanged() -> None:

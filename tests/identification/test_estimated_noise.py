@@ -9,7 +9,6 @@ import pytest
 from numpy.testing import assert_allclose
 
 import mjfim
-from mjfim.arrays import Array
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.search import FitSearch, FitTask
 from mjfim.optimize.condensed_least_squares import Condensed
@@ -38,36 +37,30 @@ def problem(task: FitTask) -> FitProblem:
     return task.problem()
 
 
-def in_turn(problem: FitProblem, theta: Array) -> tuple[Array, Array]:
-    """The oracle: the noise of the residuals, and a fit with this noise, in turn.
-
-    It begins a little beside theta, so that a wrong theta shows. Returned are theta and its
-    standard deviations.
-    """
-    found, weighted = problem.begin(theta * 1.01), problem
-    correction = problem.value_count / (problem.value_count - problem.unknown_count)
-    for _ in range(6):
-        variances = [float(np.mean(e**2)) * correction for e in problem.errors_at(found)]
-        noise = Noise(covariance=np.diag(variances), strides=problem.noise.strides)
-        weighted = problem.with_noise(noise)
-        solved = minimise(weighted, found, SearchSettings(tolerance=1e-5), Budget())
-        assert solved.success
-        found = solved.unknowns
-    information = weighted.condense(found).information()
-    return found.theta, np.sqrt(np.diag(np.linalg.inv(information)))
-
-
 @pytest.mark.slow
 def test_an_estimate_with_estimated_noise_is_that_of_searches_in_turn(
     task: FitTask, problem: FitProblem
 ) -> None:
-    """There are as much squares as degrees of freedom."""
+    """There are as much squares as degrees of freedom.
+
+    The noise of the residuals and a fit with this noise follow each other. They begin a little
+    beside the estimate, so that a wrong one shows.
+    """
     experiment = task.system.experiment.replace(fit={"segments": "whole"})
     found = mjfim.identify(experiment, task.recordings, threads=1)
     assert found.converged
     assert abs(found.chi2 / found.dof - 1.0) < 1e-3
-    theta, sigma = in_turn(problem, found.theta)
-    assert (np.abs(found.theta - theta) < 1e-2 * sigma).all()
+    at, weighted = problem.begin(found.theta * 1.01), problem
+    correction = problem.value_count / (problem.value_count - problem.unknown_count)
+    for _ in range(6):
+        variances = [float(np.mean(e**2)) * correction for e in problem.errors_at(at)]
+        noise = Noise(covariance=np.diag(variances), strides=problem.noise.strides)
+        weighted = problem.with_noise(noise)
+        solved = minimise(weighted, at, SearchSettings(tolerance=1e-5), Budget())
+        assert solved.success
+        at = solved.unknowns
+    sigma = np.sqrt(np.diag(np.linalg.inv(weighted.condense(at).information())))
+    assert (np.abs(found.theta - at.theta) < 1e-2 * sigma).all()
     assert_allclose(found.std, sigma, rtol=1e-2)
 
 

@@ -28,14 +28,9 @@ ALL = {
 }
 
 
-def rotation(rng: np.random.Generator, p: int = 4) -> Array:
-    """Random orthogonal matrix."""
-    return np.linalg.qr(rng.normal(size=(p, p)))[0]
-
-
 def matrix(values: Array, seed: int = 0) -> Array:
     """Symmetric matrix with these eigenvalues and random eigenvectors."""
-    Q = rotation(np.random.default_rng(seed), len(values))
+    Q = np.linalg.qr(np.random.default_rng(seed).normal(size=(len(values),) * 2))[0]
     return Q @ np.diag(values) @ Q.T
 
 

@@ -30,13 +30,6 @@ SOUND = {
 }
 
 
-def load(folder: Path, text: str = ARM, **changed: str) -> ModelSource:
-    """Load the arm with some changed numbers."""
-    path = folder / "arm.xml"
-    path.write_text(text.format(**{**SOUND, **changed}), encoding="utf-8")
-    return ModelSource(path)
-
-
 @pytest.mark.parametrize(
     ("key", "value"),
     [
@@ -49,5 +42,7 @@ def load(folder: Path, text: str = ARM, **changed: str) -> ModelSource:
     ],
 )
 def test_numbers_that_are_no_numbers(key: str, value: str, tmp_path: Path) -> None:
+    path = tmp_path / "arm.xml"
+    path.write_text(ARM.format(**{**SOUND, key: value}), encoding="utf-8")
     with pytest.raises(ModelError, match=r"arm\.xml: the model contains NaN"):
-        load(tmp_path, **{key: value})
+        ModelSource(path)

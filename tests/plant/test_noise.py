@@ -25,11 +25,6 @@ def correlated(strides: tuple[int, ...] = (1, 1, 1, 1)) -> Noise:
     return Noise(covariance=FULL, strides=np.array(strides))
 
 
-def half_square(rows: Array) -> float:
-    """Half the squares of whitened residuals: their part of minus the log-density."""
-    return 0.5 * float(rows @ rows)
-
-
 def test_jacobians_are_whitened_like_residuals() -> None:
     """With any trailing axes; products of whitened rows are the Fisher information by the precision
     matrix.
@@ -77,7 +72,7 @@ def test_missing_values_are_marginalised() -> None:
         if seen.any():
             density = multivariate_normal(np.zeros(seen.sum()), FULL[np.ix_(seen, seen)])
             drop = density.logpdf(np.zeros(seen.sum())) - density.logpdf(row[seen])
-            assert drop == pytest.approx(half_square(own), rel=1e-10)
+            assert drop == pytest.approx(0.5 * own @ own, rel=1e-10)
         else:
             assert own.size == 0
     assert_array_equal(noise.whiten_present(np.where(present, values, 7.0), present), white)

@@ -44,18 +44,12 @@ def random_states(space, rng: np.random.Generator, count: int = COUNT) -> np.nda
     return states
 
 
-def random_rotations(count: int, longest: float, rng: np.random.Generator) -> np.ndarray:
-    """Rotation vectors of every direction, up to a length [rad]."""
-    axis = rng.normal(size=(count, 3))
-    length = rng.uniform(0.0, longest, (count, 1))
-    return length * axis / np.linalg.norm(axis, axis=1, keepdims=True)
-
-
 def random_steps(space, longest: float, rng: np.random.Generator, count: int = COUNT) -> np.ndarray:
-    """Tangent vectors whose rotations are at most `longest` long [rad]."""
+    """Tangent vectors whose rotations have any direction and at most the `longest` length [rad]."""
     dx = rng.normal(size=(count, space.nx))
     for _, v in space.quaternions:
-        dx[:, v : v + 3] = random_rotations(count, longest, rng)
+        lengths = np.linalg.norm(dx[:, v : v + 3], axis=1, keepdims=True)
+        dx[:, v : v + 3] *= rng.uniform(0.0, longest, (count, 1)) / lengths
     return dx
 
 

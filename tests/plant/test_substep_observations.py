@@ -122,37 +122,27 @@ def test_observations_agree_with_plain_steps_at_every_engine_step(
     assert (np.abs(torques).max() == 0.9) is not lifted
 
 
-def rows_of_sample(
-    model: Any, state: Array, ctrl: Array, observations: SubstepObservations, substeps: int
-) -> Array:
-    """(S, 9) values of one sample at the rows with derivatives; the last row has the forces at the
-    beginning of the sample with RK4, and otherwise those at its end.
-    """
-    values, forces = played_with_forces(model, state, ctrl[None], substeps)
-    chosen = values[0, np.array(observations.derivative_substeps) - 1]
-    edge = 0 if model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4 else -1
-    return np.concatenate([chosen, np.append(chosen[edge, :5], forces[0, edge])[None]])
-
-
 def differences(
     task: DesignTask, sample: int, observations: SubstepObservations, step: float = 1e-6
 ) -> Array:
-    """(S, 9, nx+nu) central differences of plain loops over one sample of the lifted plant."""
-    plant, u = task.plant, task.control[sample]
+    """(S, 9, nx+nu) central differences of plain loops over one sample of the lifted plant.
+
+    The last row has the forces at the beginning of the sample with RK4, and otherwise those at its
+    end.
+    """
+    plant, u, substeps = task.plant, task.control[sample], task.system.grid.substeps
     model, x = plant.model(task.theta), task.initial.state[sample]
-    loop, nx, columns = Loop(model, task.system.grid.substeps), task.space.nx, []
+    loop, nx, columns = Loop(model, substeps), task.space.nx, []
+    rows = np.array(observations.derivative_substeps) - 1
+    edge = 0 if model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4 else -1
     for e in step * np.eye(nx + len(u)):
-        up, down = (
-            rows_of_sample(
-                model,
-                loop.plus(x, sign * e[:nx]),
-                u + sign * e[nx:],
-                observations,
-                task.system.grid.substeps,
-            )
-            for sign in (1.0, -1.0)
-        )
-        columns.append((up - down) / (2 * step))
+        ends = []
+        for move in (e, -e):
+            ctrl = (u + move[nx:])[None]
+            values, forces = played_with_forces(model, loop.plus(x, move[:nx]), ctrl, substeps)
+            chosen = values[0, rows]
+            ends.append([*chosen, np.append(chosen[edge, :5], forces[0, edge])])
+        columns.append(np.subtract(*ends) / (2 * step))
     return np.stack(columns, axis=-1)
 
 
