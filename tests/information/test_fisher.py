@@ -17,6 +17,7 @@ from mjfim.information.fisher import FisherInformation
 from mjfim.plant.outputs import Noise
 from mjfim.records.trajectory import Sensitivity
 from tests.support.numerics import (
+    PRODUCT,
     cart_task,
     independent_noise,
     relative_error,
@@ -25,12 +26,6 @@ from tests.support.numerics import (
 )
 
 SIGMA = np.array([0.1, 0.5, 2.0])
-
-
-def random_sensitivity(seed: int, N: int = 12, p: int = 4, nx: int = 5) -> Sensitivity:
-    """Random psi and G."""
-    rng = np.random.default_rng(seed)
-    return Sensitivity(psi=rng.normal(size=(N + 1, nx, p)), G=rng.normal(size=(N + 1, 3, p)))
 
 
 def information(stride: int = 1, criterion: str = "E", **changes) -> FisherInformation:
@@ -194,19 +189,13 @@ def test_standard_deviations_survive_parameters_of_very_different_size() -> None
     assert np.isinf(standard_deviations(np.diag([0.0, 1.0]))).all()
 
 
-PRODUCT = {
-    "gear": {"target": "actuator/force:gear[0]"},
-    "gain": {"target": "actuator/force:gainprm[0]"},
-    "mass": {"target": "body/bob:mass"},
-}
-
-
 @pytest.mark.parametrize("interest", [None, np.array([0, 2])])
 def test_information_and_accumulated_deviations_are_those_of_a_plain_sum(
     interest: np.ndarray | None,
 ) -> None:
     """Priors, correlated noise and nuisance parameters count; the known start does not."""
-    S, strides = random_sensitivity(7), np.array([1, 2, 3])
+    rng, strides = np.random.default_rng(7), np.array([1, 2, 3])
+    S = Sensitivity(psi=rng.normal(size=(13, 5, 4)), G=rng.normal(size=(13, 3, 4)))
     covariance = np.array([[0.01, 0.03, 0.0], [0.03, 0.25, 0.0], [0.0, 0.0, 4.0]])
     made = replace(
         information(),

@@ -20,13 +20,13 @@ from mjfim.information.identifiability import (
     Identifiability,
     require_visible,
 )
-from tests.support.numerics import CART_PARAMETERS, Array, cart_task, make_task, sensitivity_of
-
-PRODUCT = {
-    "gear": {"target": "actuator/force:gear[0]"},
-    "gain": {"target": "actuator/force:gainprm[0]"},
-    "mass": {"target": "body/bob:mass"},
-}
+from tests.support.numerics import (
+    CART_PARAMETERS,
+    PRODUCT,
+    cart_task,
+    make_task,
+    sensitivity_of,
+)
 
 TWO = """
 <mujoco model="two">
@@ -202,11 +202,6 @@ def test_a_contact_shorter_than_a_sample_period_shows_its_stiffness(tmp_path) ->
         assert look(task).along_trajectory.count == 0
 
 
-def controls(task: DesignTask) -> list[Array]:
-    """Controls of the random trajectories."""
-    return [probe.ctrl for probe in task.probes(PROBES)]
-
-
 def test_random_controls_stay_in_the_ranges_of_the_actuators_and_about_the_initial_one(
     tmp_path,
 ) -> None:
@@ -217,8 +212,11 @@ def test_random_controls_stay_in_the_ranges_of_the_actuators_and_about_the_initi
         "frequency": 2.0,
     }
     made, again, other = (
-        controls(two_task(tmp_path, initial={"control": control}, descent={"seed": seed}))
-        for seed in (1, 1, 2)
+        [probe.ctrl for probe in task.probes(PROBES)]
+        for task in (
+            two_task(tmp_path, initial={"control": control}, descent={"seed": seed})
+            for seed in (1, 1, 2)
+        )
     )
     assert len({c.tobytes() for c in made}) == len(made) == PROBES
     left, right = np.array(made).transpose(2, 0, 1)

@@ -4,13 +4,10 @@ in closed form.
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from mjfim.excitation.task import DesignTask
 from mjfim.information.null_space import NullSpace, find_null_space, parameter_groups
 from tests.support.numerics import Array, make_task, sensitivity_of
 
@@ -171,18 +168,14 @@ DOUBLE = """
 """
 
 
-def double_pendulum(folder: Path, coordinates: str) -> DesignTask:
-    """Both inertias unknown, both joints driven and measured."""
-    parameters = {name: {"inertial": name, "coordinates": coordinates} for name in "ab"}
+def test_a_double_pendulum_shows_its_base_parameters(tmp_path) -> None:
+    """Both inertias are unknown, both joints driven and measured."""
+    parameters = {name: {"inertial": name, "coordinates": "barycentric"} for name in "ab"}
     control = {"kind": "multisine", "amplitude": 2.0, "frequency": 1.0}
     initial = {"qpos": (0.4, 0.5), "control": control}
-    return make_task(
-        DOUBLE, folder, parameters=parameters, noise={"state": 1e-3}, initial=initial, horizon=1.0
+    task = make_task(
+        DOUBLE, tmp_path, parameters=parameters, noise={"state": 1e-3}, initial=initial, horizon=1.0
     )
-
-
-def test_a_double_pendulum_shows_its_base_parameters(tmp_path) -> None:
-    task = double_pendulum(tmp_path, "barycentric")
     seen = task.identifiability_test.along(task.initial, sensitivity_of(task))
     assert (seen.along_trajectory.count, seen.along_all.count) == (14, 14)
     lumped, silent = seen.groups_along_all

@@ -67,17 +67,17 @@ def squares(executor: Any, count: int = 5) -> list[tuple[int, tuple[int, ...]]]:
     return list(carry_out(executor, square, range(count), Budget()))
 
 
-@pytest.mark.parametrize("error", [BrokenExecutor("killed"), CancelledError(), KeyboardInterrupt()])
+# An error of Dask counts as a loss, though Dask is not imported.
+KilledWorker = type("KilledWorker", (Exception,), {"__module__": "distributed.scheduler"})
+
+
+@pytest.mark.parametrize(
+    "error", [BrokenExecutor("killed"), CancelledError(), KeyboardInterrupt(), KilledWorker()]
+)
 def test_lost_orders_are_done_again_and_the_results_are_the_same(error: BaseException) -> None:
     executor = FakeExecutor(lambda order, times: error if times <= order % 3 else None)
     assert squares(executor) == [(k, (k * k,)) for k in range(5)]
     assert executor.submitted.count(2) == 3
-
-
-def test_an_error_of_dask_counts_as_a_loss_though_dask_is_not_imported() -> None:
-    kind = type("KilledWorker", (Exception,), {"__module__": "distributed.scheduler"})
-    executor = FakeExecutor(lambda order, times: kind() if times == 1 else None)
-    assert squares(executor) == [(k, (k * k,)) for k in range(5)]
 
 
 def test_an_order_that_is_lost_three_times_is_reported_and_the_others_go_on() -> None:

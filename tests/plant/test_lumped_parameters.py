@@ -8,14 +8,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from mjfim.excitation.search.levels import DescentLevel
 from mjfim.plant.plant import LumpedParameters
-from tests.support.numerics import cart_task
-
-# The force of the cart is the product of the gain and the gear of its motor.
-PRODUCT = {
-    "gear": {"target": "actuator/force:gear[0]"},
-    "gain": {"target": "actuator/force:gainprm[0]"},
-    "mass": {"target": "body/bob:mass"},
-}
+from tests.support.numerics import PRODUCT, cart_task
 
 # The combination of gear, gain and mass that does not change the force, and one that does.
 WITHOUT_EFFECT = np.array([[1.0], [-1.0], [0.0]])

@@ -105,6 +105,13 @@ CART_PARAMETERS = {
     "l": {"target": "body/bob:pos[2]"},
     "c": {"target": "joint/hinge:damping"},
 }
+
+# The force of the cart is the product of the gain and the gear of its motor.
+PRODUCT = {
+    "gear": {"target": "actuator/force:gear[0]"},
+    "gain": {"target": "actuator/force:gainprm[0]"},
+    "mass": {"target": "body/bob:mass"},
+}
 BODY_PARAMETERS = {
     "mass": {"target": "body/arm:mass"},
     "com": {"target": "body/arm:ipos[2]"},
