@@ -99,8 +99,8 @@ def identify(
         kind = Check if (predicted / "check.npz").is_file() else Design
         prediction = kind.load(predicted)
     system = System.resolve(stated, threads=run.threads)
-    fitted_paths = recording_paths(recordings, system.channels)
-    held_out_paths = recording_paths(held_out or [], system.channels)
+    fitted_paths = recording_paths(recordings, system.channels.spec)
+    held_out_paths = recording_paths(held_out or [], system.channels.spec)
     models = identified_models(run.output, system.model_path)
     drawn = sample_files(run.output) if samples else ()
     logs_read = [*recordings, *(held_out or [])]
@@ -231,8 +231,8 @@ def payload(
     )
     # All logs hold the same signals, whether the payload is there or not.
     system = task.system()
-    paths = recording_paths(recordings, system.channels)
-    unloaded = recording_paths(without or [], system.channels)
+    paths = recording_paths(recordings, system.channels.spec)
+    unloaded = recording_paths(without or [], system.channels.spec)
     models = identified_models(run.output, system.model_path)
     run.claim(mjfim.Estimate, stated, [*recordings, *(without or []), robot], models)
 

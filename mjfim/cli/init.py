@@ -11,7 +11,7 @@ from mjfim.cli.common import Force, ModelFile, claim_file, verb
 from mjfim.cli.progress import out, progress, say
 from mjfim.errors import ExperimentError
 from mjfim.files import replacing
-from mjfim.studies import GROUPS, Group
+from mjfim.studies import GROUPS
 
 if TYPE_CHECKING:
     from mjfim.studies.first_candidates import Wishes
@@ -35,7 +35,7 @@ def init(
         typer.Option(
             metavar="GROUPS",
             help="Groups of parameters to propose, separated by commas: payload, friction, "
-            "inertia, motors.",
+            "inertia, motors; with --log also servos: the laws of position servos.",
         ),
     ] = ",".join(GROUPS),
     payload: Annotated[
@@ -68,10 +68,20 @@ def init(
     force: Force = False,
 ) -> None:
     """Write a first experiment file for a model, with a comment for every choice."""
+    from dataclasses import replace
+
+    import numpy as np
+
     from mjfim.cli.questions import ask as ask_for
+    from mjfim.experiment.schema import Experiment
+    from mjfim.experiment.system import System
     from mjfim.model.given import packed
     from mjfim.model.model_files import is_urdf
-    from mjfim.studies.first_candidates import Wishes
+    from mjfim.recordings.formats import read_columns
+    from mjfim.recordings.proposal import log_time, proposed_recording
+    from mjfim.recordings.read import recording_paths
+    from mjfim.recordings.section import RecordingSpec
+    from mjfim.studies.first_candidates import Wishes, groups_of
     from mjfim.studies.first_experiment import experiment_text, propose_experiment
 
     model = Path(packed(str(model), Path())[0])
@@ -82,7 +92,12 @@ def init(
         if not Path(place).is_dir() or not place:
             raise ExperimentError(f"--package: needs NAME=DIR with a folder, not {name}={place}")
         packages[name] = str(Path(place).resolve())
-    wishes = Wishes(groups=_groups(parameters), payload=payload, packages=packages)
+    table, row = None, None
+    if log is not None:
+        table = read_columns(recording_paths([log], RecordingSpec())[0], RecordingSpec())
+        steps = np.diff(log_time(table)[1])
+        row = float(np.median(steps)) if len(steps) else None
+    wishes = Wishes(groups=groups_of(parameters), payload=payload, packages=packages, row=row)
     claim_file(file, [model], force=force)
     if is_urdf(model):
         claim_file(companion, [model], force=force)
@@ -94,8 +109,12 @@ def init(
 
     proposal = propose(ask_for(propose, wishes) if ask else wishes)
     text = experiment_text(proposal)
-    if log is not None:
-        text += f"\n# Read {log.name}: check what was guessed.\n{_recording(log, proposal)}\n"
+    if table is not None:
+        experiment = Experiment(**proposal.values(), directory=file.parent)
+        channels = System.resolve(experiment, source=proposal.source).channels
+        # What servos of the MJCF take, a log holds in either case.
+        found = proposed_recording(table, replace(channels, model=proposal.compiled))
+        text += f"\n# Read {table.source.name}: check what was guessed.\n{found}\n"
 
     if proposal.companion is not None:
         with replacing(companion) as temporary:
@@ -109,39 +128,3 @@ def init(
         say(remark)
     after = f"check {file}" if log is None else f"identify {file} {log}"
     out.print(f"next: mjfim {after}", soft_wrap=True)
-
-
-def _recording(log: Path, proposal: Proposal) -> str:
-    """The table `[recording]` that is proposed for a log."""
-    import numpy as np
-
-    from mjfim.experiment.signals import columns_of_keys
-    from mjfim.model.coordinates import ModelCoordinates
-    from mjfim.recordings.channels import Channels
-    from mjfim.recordings.formats import read_columns
-    from mjfim.recordings.proposal import proposed_recording
-    from mjfim.recordings.read import recording_paths
-    from mjfim.recordings.section import RecordingSpec
-
-    columns = columns_of_keys(ModelCoordinates.of(proposal.compiled))
-    channels = Channels(
-        model=proposal.compiled,
-        controls=tuple(proposal.amplitudes),
-        laws=None,
-        outputs=tuple(name for key, _, _ in proposal.noise for name in columns[key]),
-        sigma=np.zeros(0),
-        spec=RecordingSpec(),
-        source=proposal.model,
-    )
-    table = read_columns(recording_paths([log], channels)[0], channels.spec)
-    return proposed_recording(table, channels)
-
-
-def _groups(text: str) -> list[Group]:
-    """Groups of parameters of the option `--parameters`."""
-    from mjfim.studies.first_candidates import groups_of
-
-    try:
-        return groups_of(text)
-    except ExperimentError as error:
-        raise ExperimentError(f"--parameters: {error}") from None

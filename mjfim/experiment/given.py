@@ -111,7 +111,7 @@ def _recordings(system: System, given: RecordingLike) -> Iterator[Recording]:
     elif given == "":
         raise RecordingError('recordings: "" names no log; give the path of one')
     elif isinstance(given, (str, Path)):
-        for path in recording_paths([Path(given)], channels):
+        for path in recording_paths([Path(given)], channels.spec):
             yield read_recording(path, channels)
     else:
         # The table is about logs; MuJoCo's arrays have MuJoCo's names and units.

@@ -30,7 +30,7 @@ from mjfim.model.coordinates import (
     unknown_coordinate,
 )
 from mjfim.model.loading import ModelSource
-from mjfim.model.units import acts_at_joint, per_second
+from mjfim.model.units import acts_at_joint, commanded_joint, per_second
 from mjfim.model.variants import ModelVariant
 from mjfim.plant.outputs import Noise, Output, Outputs
 from mjfim.plant.state_space import StateSpace
@@ -405,6 +405,7 @@ def resolve_controllers(
                 differences=spec.velocity == "difference",
                 reference_differences=spec.reference_velocity == "difference",
                 integrates=_integrates(experiment, actuator, spec),
+                replaces_servo=bool(numbers[actuator]["servo"]),
             )
         )
     return source, ControlLaws(laws=tuple(laws), inputs=tuple(inputs))
@@ -450,18 +451,26 @@ def _numbers(
     model: Any, actuator: str, spec: ControllerSpec, joint: ScalarJoint
 ) -> dict[str, float]:
     """Numbers of a law by their names among the custom numbers of a model."""
-    control = int(model.actuator_ctrladr[actuator_names(model).index(actuator)])
+    number = actuator_names(model).index(actuator)
+    has_gain = "kp" in spec.model_fields_set
+    is_servo = has_gain and commanded_joint(model, number) == joint.joint
+    # The control of a servo is no force.
+    limited, ranges, place = model.actuator_forcelimited, model.actuator_forcerange, number
+    if not is_servo:
+        place = int(model.actuator_ctrladr[number])
+        limited, ranges = model.actuator_ctrllimited, model.actuator_ctrlrange
     low, high = -np.inf, np.inf
     if spec.saturation is not None:
         low, high = spec.saturation
-    elif model.actuator_ctrllimited[control]:
-        low, high = model.actuator_ctrlrange[control].tolist()
+    elif limited[place]:
+        low, high = ranges[place].tolist()
 
     stated = {name: getattr(spec, name) for name in NUMBERS if not name.startswith("saturation_")}
     return {
         **{name: np.inf if number is None else number for name, number in stated.items()},
         "joint": float(joint.joint),
         "kind": float(KINDS.index(spec.kind)),
+        "servo": float(is_servo),
         "saturation_low": low,
         "saturation_high": high,
     }

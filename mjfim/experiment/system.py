@@ -28,7 +28,7 @@ from mjfim.experiment.schema import Experiment, ExperimentLike, experiment_of
 from mjfim.experiment.signals import TimeGrid, noise_strides, resolve_controllers, resolve_outputs
 from mjfim.experiment.stated_units import require_units
 from mjfim.model.clearance import with_floor
-from mjfim.model.control_laws import FIELDS, TIMES, ControlLaws, law_unit
+from mjfim.model.control_laws import FIELDS, ControlLaws, law_unit
 from mjfim.model.coordinates import (
     ScalarJoint,
     control_labels,
@@ -41,7 +41,7 @@ from mjfim.model.parameter_writer import MOMENT_ROUNDING, ParameterWriter
 from mjfim.model.parameters import ParameterSet
 from mjfim.model.terms.library import KINDS
 from mjfim.model.terms.term import ELEMENT_KEYS, Term, TermTable
-from mjfim.model.units import FORCE_UNITS, control_unit, per_second
+from mjfim.model.units import per_second
 from mjfim.model.variants import STATED, MocapPlacement, ModelVariant, PlantModel, Relaxation
 from mjfim.parallel import require_threads
 from mjfim.plant.batch import state_space
@@ -609,10 +609,6 @@ def labels_of_model(model: mujoco.MjModel) -> Labels:
     )
 
 
-# Numbers with which a law is more than a position servo, unless they have no effect.
-BEYOND_SERVOS = {*TIMES, "ki", "slew", "acceleration"}
-
-
 def laws_in_loop(
     system: System, theta: Array, clipped: Mapping[str, float]
 ) -> tuple[ControlLawInLoop, ...]:
@@ -629,7 +625,8 @@ def laws_in_loop(
     if system.laws is None:
         return ()
     model = system.plant.model(theta)
-    paths = {target.path for p in system.parameters.parameters for target in p.targets}
+    targets = [target for each in system.parameters.parameters for target in each.targets]
+    paths = {target.path.partition("[")[0] for target in targets}
     found = []
     for law in system.laws.laws:
         values = law.numbers(model)
@@ -643,10 +640,8 @@ def laws_in_loop(
                     numbers[key] = values[name]
                     units[key] = law_unit(model, law.actuator, field)
 
-        plain = BEYOND_SERVOS.isdisjoint(numbers) and not law.differences
-        unit = control_unit(model, int(model.actuator(law.actuator).id))
-        is_servo = plain and unit in FORCE_UNITS.values() and set(law.columns) == {"reference"}
-        estimated = (key for key in numbers if f"controller/{law.actuator}:{key}" in paths)
+        own = f"controller/{law.actuator}:"
+        estimated = (key for key in numbers if own + key.partition("[")[0] in paths)
         found.append(
             ControlLawInLoop(
                 actuator=law.actuator,
@@ -657,7 +652,7 @@ def laws_in_loop(
                 units=units,
                 estimated=tuple(estimated),
                 clipped=clipped.get(law.actuator, 0.0),
-                is_servo=is_servo,
+                replaces_servo=law.replaces_servo,
             )
         )
     return tuple(found)

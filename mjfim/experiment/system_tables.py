@@ -66,6 +66,9 @@ class ControllerSpec(Section):
     `kp (reference - position) + kd (reference velocity - velocity) + integral + feed-forward`. It
     is clipped to its range and has the unit of the actuator, which is called u here. Unknown
     numbers are parameters, with the target `controller/<actuator>:kp` for example.
+
+    A law that states `kp` takes the place of a `<position>` servo at its joint: the actuator is a
+    motor then, without the ranges of the servo. Other laws compute the control of the servo.
     """
 
     kind: Literal["torque", "voltage", "current"] | None = Field(
@@ -138,7 +141,10 @@ class ControllerSpec(Section):
     )
     saturation: tuple[Bound, Bound] | None = Field(
         default=None,
-        description="Range of the control [u]. Default: the ctrlrange of the actuator.",
+        description=(
+            "Range of the control [u]. Default: the ctrlrange of the actuator, or the forcerange "
+            "of the servo whose place the law takes."
+        ),
     )
     slew: Positive | None = Field(
         default=None, description="Largest change of the control per second [u/s]. Default: any."

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Literal
 
+import mujoco
 import numpy as np
 
 from mjfim.arrays import record
@@ -27,8 +28,9 @@ PREFIX = "mjfim controller "
 Kind = Literal["torque", "voltage", "current"]
 KINDS: tuple[Kind | None, ...] = (None, "torque", "voltage", "current")
 
-# Custom numbers of a law, in their order. The first two describe it and are no parameters.
-DESCRIPTION = ("joint", "kind")
+# Custom numbers of a law, in their order. The first ones describe it and are no parameters; `servo`
+# is 1 where the law takes the place of a position servo of the MJCF.
+DESCRIPTION = ("joint", "kind", "servo")
 NUMBERS = (
     "kp",
     "kd",
@@ -87,6 +89,7 @@ class ControlLaw:
         reference_differences: True where the driver takes the velocity of the reference from
             differences of the reference.
         integrates: True where the law may have an integral.
+        replaces_servo: True where the law takes the place of a position servo of the MJCF.
     """
 
     actuator: str
@@ -101,14 +104,12 @@ class ControlLaw:
     differences: bool
     reference_differences: bool
     integrates: bool
-
-    def row(self, name: str) -> int:
-        """Place of one of `NUMBERS` among the custom numbers of the model."""
-        return self.first + NUMBERS.index(name)
+    replaces_servo: bool
 
     def numbers(self, model: Any) -> dict[str, float]:
         """Values of all `NUMBERS` in a model, by name."""
-        return {name: float(model.numeric_data[self.row(name)]) for name in NUMBERS}
+        values = model.numeric_data[self.first :].tolist()
+        return dict(zip(NUMBERS, values, strict=False))
 
 
 # Columns that follow the inputs of a log for every law with an integral, see `ControlLaws`.
@@ -176,11 +177,6 @@ class ControlLaws:
         return tuple(tuple(law for law in self.laws if law.tick == tick) for tick in ticks)
 
 
-def number_name(actuator: str) -> str:
-    """Name of the custom numbers of the law of an actuator."""
-    return f"{PREFIX}{actuator}"
-
-
 def controllers_of(model: Any) -> list[str]:
     """Names of the actuators whose laws a compiled model (`mujoco.MjModel`) holds."""
     names = [model.numeric(i).name for i in range(model.nnumeric)]
@@ -188,40 +184,35 @@ def controllers_of(model: Any) -> list[str]:
 
 
 def with_laws(source: ModelSource, numbers: Mapping[str, Mapping[str, float]]) -> ModelSource:
-    """A model with the numbers of control laws.
+    """A model with the numbers of control laws, and motors where laws take the place of servos.
 
     Args:
         source: The user's model, without laws.
         numbers: Values of `DESCRIPTION` and `NUMBERS` by name, for every actuator with a law.
-
-    Returns:
-        The model; the source itself without laws.
     """
-    if not numbers:
-        return source
     every = tuple(
-        (number_name(actuator), tuple(values[name] for name in (*DESCRIPTION, *NUMBERS)))
+        (actuator, tuple(values[name] for name in (*DESCRIPTION, *NUMBERS)))
         for actuator, values in numbers.items()
     )
 
     def add(spec: Any) -> None:
         """Add custom numbers, which MuJoCo ignores."""
-        for name, data in every:
-            spec.add_numeric(name=name, size=len(data), data=list(data))
+        for actuator, data in every:
+            spec.add_numeric(name=f"{PREFIX}{actuator}", size=len(data), data=list(data))
+            if numbers[actuator]["servo"]:
+                motor = spec.actuator(actuator)
+                lag = motor.dyntype
+                motor.set_to_motor()
+                motor.dyntype = lag
+                # Its control was a position, and the law has the range of its force.
+                motor.ctrllimited = motor.forcelimited = mujoco.mjtLimited.mjLIMITED_FALSE
 
     return source.with_elements(every, add)
 
 
-def remove_numbers(spec: Any) -> None:
-    """Remove the numbers of control laws from a spec (`mujoco.MjSpec`), in place."""
-    for numeric in list(spec.numerics):
-        if numeric.name.startswith(PREFIX):
-            spec.delete(numeric)
-
-
 def first_number(model: Any, actuator: str) -> int:
     """Place of the first of `NUMBERS` of the law of an actuator among all custom numbers."""
-    numeric = model.numeric(number_name(actuator))
+    numeric = model.numeric(f"{PREFIX}{actuator}")
     return int(model.numeric_adr[numeric.id]) + len(DESCRIPTION)
 
 
@@ -230,19 +221,21 @@ def is_law_number(field: object) -> bool:
     return isinstance(field, ModelField) and field.array == "numeric_data"
 
 
-def law_field(model: Any, actuator: str, field: str, component: int) -> ModelField:
+def law_field(model: Any, actuator: str, field: str, index: int | None) -> ModelField:
     """The field of a number of a law.
 
     Args:
         model: The compiled model (`mujoco.MjModel`), which holds the law.
         actuator: Name of the actuator.
         field: A key of `FIELDS`.
-        component: Index of the component.
+        index: Index of the component; None for both ends of a range, of which the lower one is
+            minus the upper one.
 
     Raises:
         ExperimentError: The law does not limit anything by this number.
     """
-    place = first_number(model, actuator) + NUMBERS.index(FIELDS[field][component])
+    first, names = first_number(model, actuator), FIELDS[field]
+    place = first + NUMBERS.index(names[-1 if index is None else index])
     if not np.isfinite(model.numeric_data[place]):
         raise ExperimentError(
             f"the law states no {field}, so that there is no number from which a fit could begin; "
@@ -255,10 +248,13 @@ def law_field(model: Any, actuator: str, field: str, component: int) -> ModelFie
     if field in TIMES:
         size = model.opt.timestep
     elif field == "integral":
-        first = place - NUMBERS.index("integral") + NUMBERS.index("saturation_low")
-        ends = np.abs(model.numeric_data[first : first + 2])
+        low = first + NUMBERS.index("saturation_low")
+        ends = np.abs(model.numeric_data[low : low + 2])
         size = float(ends[np.isfinite(ends)].max(initial=0.0))
-    return ModelField(array="numeric_data", rows=(place,), size=size)
+    # The lower end of a range stands before the upper one.
+    lower = ("numeric_data", place - 1, 0, -1.0)
+    followers = (lower,) if index is None and len(names) > 1 else ()
+    return ModelField(array="numeric_data", rows=(place,), size=size, followers=followers)
 
 
 def law_unit(model: Any, actuator: str, field: str) -> str:
@@ -275,7 +271,7 @@ def law_unit(model: Any, actuator: str, field: str) -> str:
         return ""
 
     first = first_number(model, actuator) - len(DESCRIPTION)
-    joint, kind = (int(model.numeric_data[first + i]) for i in range(len(DESCRIPTION)))
+    joint, kind, _ = (int(model.numeric_data[first + i]) for i in range(len(DESCRIPTION)))
     coordinate = joint_unit(model, joint)
     profile = {"jump": coordinate, "acceleration": f"{coordinate}/s²"}
     if field in profile:

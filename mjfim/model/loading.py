@@ -219,11 +219,11 @@ class ModelSource:
             return found
 
     def with_elements(self, key: tuple[Any, ...], add: Callable[[Any], object]) -> ModelSource:
-        """This model with elements that do not change its motion, compiled once while in use.
+        """This model with elements that are no terms, compiled once while in use.
 
         Args:
             key: Identifies the elements.
-            add: Adds them to an MjSpec.
+            add: Adds them to an MjSpec, and may change it.
 
         Returns:
             The model; it has the terms of this one, and the same model of the file.

@@ -427,9 +427,9 @@ def _law_field(model: Any, path: ParameterPath) -> TargetField:
         hint = "" if laws else "; the experiment file states no law in [controllers]"
         raise path.error(f"{unknown('controller', path.name, laws)}{hint}")
 
-    component = path.component_of(len(LAW_FIELDS[path.field]))
+    path.component_of(len(LAW_FIELDS[path.field]))
     try:
-        return law_field(model, path.name, path.field, component)
+        return law_field(model, path.name, path.field, path.index)
     except ExperimentError as error:
         raise path.error(str(error)) from None
 

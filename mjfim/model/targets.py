@@ -108,7 +108,8 @@ class ModelField:
             else:
                 holder[row, self.column] = self.factor * value
         for array, row, column, factor in self.followers:
-            getattr(model, array)[row, column] = factor * value
+            holder = getattr(model, array)
+            holder.reshape(len(holder), -1)[row, column] = factor * value
 
         flag = SAME_FRAME_FLAGS.get(self.array)
         if flag is not None:

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, get_args
 
 import mujoco
 
 from mjfim.arrays import Array, record
-from mjfim.errors import ExperimentError, RecordingError, unknown
+from mjfim.errors import ExperimentError, unknown
 from mjfim.model.control_laws import ControlLaws
 from mjfim.model.coordinates import (
     measurable_columns,
@@ -168,25 +167,3 @@ def require_law(where: str | Path, name: str, channels: Channels) -> None:
         f"{where}: {name!r}: the law of this actuator does not read it; state {quantity} = {value} "
         f"in [controllers.{actuator}]"
     )
-
-
-def require_one_source(where: str | Path, names: Sequence[str], channels: Channels) -> None:
-    """Refuse a log that holds the control of an actuator and the reference of its law.
-
-    Raises:
-        RecordingError: It holds both, and the experiment file does not name the control as the
-            source of an output.
-    """
-    named = {
-        source.column
-        for name, source in channels.spec.sources.items()
-        if name not in channels.control_columns
-    }
-    for law in () if channels.laws is None else channels.laws.laws:
-        control, reference = f"ctrl:{law.actuator}", f"reference:{law.actuator}"
-        if control in names and reference in names and control not in named:
-            raise RecordingError(
-                f"{where}: it holds {control!r} and {reference!r}, and "
-                f"[controllers.{law.actuator}] computes the control from the reference; remove one "
-                "of the columns, or give the measured control the name of a sensor"
-            )

@@ -17,6 +17,7 @@ from mjfim.arrays import Array
 from mjfim.errors import RecordingError
 from mjfim.model.coordinates import joint_names, scalar_joints
 from mjfim.model.elements import identifier
+from mjfim.model.units import commanded_joint
 from mjfim.recordings.channels import Channels
 from mjfim.recordings.checks import doubtful_angles, likely_unit
 from mjfim.recordings.formats import SECONDS, Table
@@ -56,7 +57,7 @@ def proposed_recording(table: Table, channels: Channels) -> str:
         Columns with mjfim's names are left out.
     """
     model, joints = channels.model, scalar_joints(channels.model)
-    time, t, lines = _time(table)
+    time, t, lines = log_time(table)
     columns = {name: _words(table, name) for name in table.names if _is_numeric(table, name)}
     columns.pop(time, None)
 
@@ -117,7 +118,7 @@ def sensors_of_joints(channels: Channels) -> dict[str, str]:
     return found
 
 
-def _time(table: Table) -> tuple[str, Array, list[str]]:
+def log_time(table: Table) -> tuple[str, Array, list[str]]:
     """Column of the time stamps, the times [s], and the first lines of the table."""
     for name in table.names:
         if KINDS["time"].isdisjoint(_words(table, name)):
@@ -181,11 +182,10 @@ def _matches(
 
 def _servos(channels: Channels) -> Iterator[tuple[str, str]]:
     """Columns of the references of position servos, each with the column of its joint."""
-    model, joints = channels.model, joint_names(channels.model)
     for i, name in enumerate(channels.control_columns):
-        is_servo = model.actuator_biastype[i] == mujoco.mjtBias.mjBIAS_AFFINE
-        if is_servo and model.actuator_trntype[i] == mujoco.mjtTrn.mjTRN_JOINT:
-            yield name, f"qpos:{joints[model.actuator_trnid[i, 0]]}"
+        joint = commanded_joint(channels.model, i)
+        if joint is not None:
+            yield name, f"qpos:{joint_names(channels.model)[joint]}"
 
 
 def _units(

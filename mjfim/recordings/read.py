@@ -31,7 +31,6 @@ from mjfim.recordings.channels import (
     Channels,
     check_spec,
     require_law,
-    require_one_source,
     units_of,
 )
 from mjfim.recordings.checks import (
@@ -228,12 +227,12 @@ def log_of(table: Table, channels: Channels) -> tuple[Recording, LogSummary]:
     return recording, summary
 
 
-def recording_paths(paths: Sequence[Path], channels: Channels) -> list[Path]:
+def recording_paths(paths: Sequence[Path], spec: RecordingSpec) -> list[Path]:
     """List the recordings that logs hold: one for each log, or for each episode of a dataset.
 
     Args:
         paths: Logs, or folders of LeRobot datasets.
-        channels: The signals of the experiment, and how to read them.
+        spec: How to read them.
 
     Raises:
         RecordingError: A dataset is damaged, or has no such episode.
@@ -241,7 +240,7 @@ def recording_paths(paths: Sequence[Path], channels: Channels) -> list[Path]:
     found = []
     for path in paths:
         is_dataset = is_lerobot_dataset(path)
-        found += lerobot_episodes(path, channels.spec) if is_dataset else [path]
+        found += lerobot_episodes(path, spec) if is_dataset else [path]
     return found
 
 
@@ -357,7 +356,6 @@ def _sources(table: Table, channels: Channels) -> dict[str, ColumnSpec]:
     """Rules of all columns of the recording, first the controls, then the measured columns."""
     stated = channels.spec.sources
     default = _columns_by_default_name(table, channels)
-    require_one_source(table.source, table.names, channels)
     controls = {
         name: stated.get(name) or ColumnSpec(column=default.get(name, name))
         for name in channels.control_columns
@@ -405,7 +403,8 @@ def _unfit(table: Table, channels: Channels, fault: str, otherwise: str = "") ->
 
 def _check_names(table: Table, channels: Channels) -> None:
     """Refuse a column whose name looks like mjfim's but does not exist in this model."""
-    known = (*channels.control_columns, *channels.measurable)
+    stated = (source.column for source in channels.spec.sources.values())
+    known = (*channels.control_columns, *channels.measurable, *stated)
     for name in table.names:
         if name.startswith(("ctrl:", "qpos:", "qvel:", *LAW_PREFIXES)) and name not in known:
             require_law(table.source, name, channels)

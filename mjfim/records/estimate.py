@@ -275,7 +275,7 @@ class ControlLawInLoop(Record):
         units: Unit of each of these numbers; may be empty.
         estimated: Keys of the numbers that are parameters.
         clipped: Share of the samples at which the limits of the law clip its control, 0 to 1.
-        is_servo: Whether a position servo of MJCF is the same law, but for its rate.
+        replaces_servo: Whether it takes the place of a position servo of the MJCF.
     """
 
     actuator: str
@@ -286,7 +286,7 @@ class ControlLawInLoop(Record):
     units: dict[str, str]
     estimated: tuple[str, ...]
     clipped: float
-    is_servo: bool
+    replaces_servo: bool
 
     @property
     def numbers_in_words(self) -> str:
@@ -310,8 +310,8 @@ class ControlLawInLoop(Record):
         )
         if self.clipped > RARELY:
             sentence += f"; its limits clip it at {100.0 * self.clipped:.2g} % of the samples"
-        if self.is_servo:
-            sentence += "; but for its rate, it is the law of <position> in MJCF with kv = kd"
+        if self.replaces_servo:
+            sentence += "; it takes the place of the servo in the MJCF"
         return f"{sentence}."
 
     @property

@@ -32,8 +32,8 @@ from mjfim.model.inertia import body_inertia
 from mjfim.model.loading import NO_PACKAGES, ModelSource, load_spec
 from mjfim.model.model_files import PACKAGE
 from mjfim.model.paths import matches, unit_of
-from mjfim.model.units import servo_kind
-from mjfim.studies import GROUPS, Group
+from mjfim.model.units import commanded_joint, servo_kind
+from mjfim.studies import EVERY_GROUP, GROUPS, Group
 
 # Comment at the head of the MJCF.
 COMMENT = (
@@ -121,6 +121,7 @@ class Wishes:
             "angular velocity" [rad/s], "velocity" [m/s]. Sensors whose noise the MJCF states keep
             it.
         packages: Folders of ROS packages by name.
+        row: Time from one row of a log to the next [s]; None without a log.
     """
 
     groups: Sequence[Group] = GROUPS
@@ -131,6 +132,7 @@ class Wishes:
     horizon: float | None = None
     sigmas: Mapping[str, float] = field(default_factory=dict)
     packages: Mapping[str, str] = field(default_factory=dict)
+    row: float | None = None
 
 
 def rounded(value: float, digits: int = 2) -> float:
@@ -144,12 +146,10 @@ def groups_of(text: str) -> list[Group]:
     Args:
         text: The names.
     """
-    found = []
-    for name in (part.strip() for part in text.split(",")):
-        group = next((each for each in GROUPS if each == name), None)
-        if group is None:
-            raise ExperimentError(unknown("group", name, GROUPS))
-        found.append(group)
+    found: list[Any] = [part.strip() for part in text.split(",")]
+    for name in found:
+        if name not in EVERY_GROUP:
+            raise ExperimentError(f"parameters: {unknown('group', name, EVERY_GROUP)}")
     return found
 
 
@@ -222,7 +222,12 @@ JOINT_FIELDS: dict[Group, tuple[tuple[str, str, str], ...]] = {
         ("frictionloss", "dof_frictionloss", "dry friction"),
     ),
     "motors": (("armature", "dof_armature", "inertia of the drive"),),
+    "servos": (("damping[1]", "dof_dampingpoly", "drag that grows with speed"),),
 }
+
+# Powers of a natural frequency and of the size of a coordinate, by which a force of friction is
+# divided for the sizes of fields of joints.
+POWERS = {"damping": (1, 1), "armature": (2, 1), "damping[1]": (2, 2)}
 
 
 @record
@@ -304,7 +309,7 @@ def candidates(
     Raises:
         ExperimentError: The body of the payload does not exist, or has no mass.
     """
-    friction, drives = (list(_joint_fields(model, group, period)) for group in JOINT_FIELDS)
+    friction, drives, _ = (list(_joint_fields(model, group, period)) for group in JOINT_FIELDS)
     found = list(_servos(model))
     found += [*friction, *drives, _delay(rate)] if found else []
     # The last body carries what the robot grasps. With a stated payload, its mass is known.
@@ -321,6 +326,88 @@ def candidates(
     if payload is not None:
         found = [*_payload(model, payload, length, period), *found]
     return _tied(model, found)
+
+
+# Numbers of servos in the order in which logs of references and angles determine them: name, path
+# by actuator and joint, and what it is; and those that equal servos share.
+OF_SERVOS = (
+    ("kp", "controller/{0}:kp", "gain of the position"),
+    ("friction", "joint/{1}:frictionloss", "dry friction"),
+    ("latency", "controller/{0}:latency", "latency"),
+    ("kd", "controller/{0}:kd", "gain of the velocity"),
+    ("damping", "joint/{1}:damping", "viscous friction"),
+    ("drag", "joint/{1}:damping[1]", "drag that grows with speed"),
+    ("duty", "controller/{0}:saturation", "largest force"),
+    ("armature", "joint/{1}:armature", "inertia of the drive"),
+)
+SHARED = ("kp", "kd", "duty", "armature")
+
+# First guess of a latency [rows of the log].
+FIRST_LATENCY = 0.5
+
+# Smallest error at which a servo has its largest force, in natural sizes of the coordinate. Servos
+# of many models are much stiffer than real ones. The gain kd answers a change with kp at most.
+LEAST_ERROR = 0.1
+
+
+def servo_laws(
+    model: Any, period: float, row: float
+) -> tuple[dict[str, dict[str, Any]], list[Candidate]]:
+    """Laws that take the place of position servos, and the numbers of servos that a log shows.
+
+    Args:
+        model: The compiled model (`mujoco.MjModel`).
+        period: Characteristic period of the motion of the robot [s].
+        row: Time from one row of the log to the next [s].
+
+    Returns:
+        Tables of `[controllers]` by actuator, none without such servos; and the parameters.
+    """
+    fields = {
+        each.paths[0]: each
+        for group in JOINT_FIELDS
+        for each in _joint_fields(model, group, period)
+    }
+    laws: dict[str, dict[str, Any]] = {}
+    servos, alike = [], dict[str, int]()
+    for i in range(model.nactuator):
+        actuator, number = element_name(model, "actuator", i), commanded_joint(model, i)
+        joint = "" if number is None else element_name(model, "joint", number)
+        if not actuator or not joint:
+            continue
+        kp, kd = float(model.actuator_gainprm[i, 0]), -float(model.actuator_biasprm[i, 2])
+        limits = {}
+        if model.actuator_forcelimited[i]:
+            limits = {"saturation": model.actuator_forcerange[i].tolist()}
+            size = position_sizes(model)[model.jnt_dofadr[number]]
+            kp = min(kp, rounded(limits["saturation"][1] / (LEAST_ERROR * size)))
+        law = laws[actuator] = {
+            "kp": kp,
+            "kd": kd if 0.0 < kd < kp * row else rounded(kp * row),
+            "reference_velocity": "difference",
+            "rate": 1.0 / float(model.opt.timestep),
+            "latency": rounded(FIRST_LATENCY * row),
+            **limits,
+        }
+        first = alike.setdefault(f"{law} {fields[f'joint/{joint}:armature'].value}", i)
+        servos.append((actuator, joint, i, first))
+
+    found = [
+        Candidate(
+            name=f"{actuator}_{name}",
+            group="servos",
+            paths=(path.format(actuator, joint),),
+            quantity=quantity,
+            owners=(actuator,),
+            family=first if name in SHARED else i,
+            scale=None if "joint" not in path else fields[path.format(actuator, joint)].scale,
+            bounds=(0.0, np.inf) if name in ("drag", "duty") else None,
+        )
+        for name, path, quantity in OF_SERVOS
+        for actuator, joint, i, first in servos
+        if name != "duty" or "saturation" in laws[actuator]
+    ]
+    return laws, _tied(model, found)
 
 
 def stated_candidates(
@@ -353,12 +440,16 @@ def stated_candidates(
 
 
 def _tied(model: Any, found: Sequence[Candidate]) -> list[Candidate]:
-    """The candidates without repeated paths, with one for all equal values of a large robot."""
+    """The candidates without repeated paths, with one for all equal values of a large robot.
+
+    Candidates of servos state by their families what is equal.
+    """
     families: dict[tuple[str, ...], dict[str, Candidate]] = {}
     for each in found:
         unit, value = unit_of(model, each.paths[0]), f"{each.value:.6g}"
         key: tuple[str, ...] = (each.quantity, value, unit, f"{each.family}")
-        if model.njnt <= FEW_JOINTS or not each.owners:
+        is_small = model.njnt <= FEW_JOINTS and each.group != "servos"
+        if is_small or not each.owners:
             key = (*each.paths, f"{each.offset}")
         families.setdefault(key, {}).setdefault(each.paths[0], each)
 
@@ -528,15 +619,14 @@ def _joint_fields(model: Any, group: Group, period: float) -> Iterator[Candidate
     """Fields of joints; those that are zero in the model have a natural size."""
     forces = STRENGTH_SHARE * _strengths(model, period)
     sizes = position_sizes(model)
-    speed = 2.0 * np.pi / period
+    frequency = 2.0 * np.pi / period
     for quantity, array, meaning in JOINT_FIELDS[group]:
-        # A force of friction, over a natural speed or acceleration.
-        power = {"damping": 1, "armature": 2}.get(quantity, 0)
+        power, of_size = POWERS.get(quantity, (0, 0))
         for joint in range(model.njnt):
             name = element_name(model, "joint", joint)
             dof = model.jnt_dofadr[joint]
-            value = float(getattr(model, array)[dof])
-            size = float(forces[dof] / speed**power / sizes[dof] ** (power > 0))
+            value = float(np.ravel(getattr(model, array)[dof])[0])
+            size = float(forces[dof] / frequency**power / sizes[dof] ** of_size)
             if name and (value > 0.0 or joint_dofs(model, joint) == 1):
                 yield Candidate(
                     name=f"{name}_{quantity}",

@@ -55,6 +55,7 @@ from mjfim.studies.first_candidates import (
     read_urdf,
     require_rate,
     rounded,
+    servo_laws,
     stated_candidates,
 )
 from mjfim.studies.first_limits import playable_limits, played
@@ -156,6 +157,8 @@ class Proposal:
         remarks: Sentences for the head of the file.
         release: Release of a model without actuators; None for a model with actuators.
         flies: Whether a free body is held in the air.
+        laws: Tables about laws of position servos that logs are to show; none for an experiment
+            that is to be designed.
     """
 
     model: str
@@ -173,6 +176,7 @@ class Proposal:
     remarks: Sequence[str] = ()
     release: ProposedRelease | None = None
     flies: bool = False
+    laws: Mapping[str, Any] = field(default_factory=dict)
 
     @property
     def compiled(self) -> Any:
@@ -195,14 +199,16 @@ class Proposal:
     def values(self) -> dict[str, Any]:
         """Keys and tables of the experiment file."""
         initial = self._initial_state()
-        values = {
-            "model": self.model,
-            "rate": self.times.rate,
-            "horizon": self.times.horizon,
-            "initial": initial,
+        values: dict[str, Any] = {"model": self.model, "rate": self.times.rate}
+        if not self.laws:
+            values |= {"horizon": self.times.horizon, "initial": initial}
+        values |= {
+            **self.laws,
             "parameters": {each.name: each.table() for each in self.chosen},
             "noise": {key: sigma for key, sigma, _ in self.noise},
         }
+        if self.laws:
+            return values
         if self.release is None:
             initial["control"] = self.control()
         else:
@@ -313,7 +319,8 @@ def propose_experiment(
     times = wanted_times(time_scale(model, data), model, wishes)
 
     sizes = {"length": length, "period": times.period, "rate": times.rate}
-    found, absent = _candidates(source, wishes, sizes)
+    has_laws = "servos" in wishes.groups
+    found, absent = ([], []) if has_laws else _candidates(source, wishes, sizes)
     controls = source.coordinates.controls
     release = None
     wanted = np.zeros(0)
@@ -360,6 +367,8 @@ def propose_experiment(
         release=release,
         flies=flies,
     )
+    if has_laws:
+        return _with_laws(draft, wishes)
     refinement = _Refinement(source=source, folder=folder, wishes=wishes)
     try:
         if release is not None:
@@ -367,6 +376,25 @@ def propose_experiment(
         return refinement.refined(draft)
     except SimulationDivergedError as error:
         raise ModelError(f"{path}: {error}") from None
+
+
+def _with_laws(draft: Proposal, wishes: Wishes) -> Proposal:
+    """The draft with the laws of position servos, which a log is to show."""
+    timestep, row = draft.compiled.opt.timestep, wishes.row or 0.0
+    laws, numbers = servo_laws(draft.compiled, draft.times.period, row)
+    if not row or not laws:
+        raise ExperimentError(
+            "parameters: servos needs a log with times (--log LOG), and a model with <position> "
+            "servos that have names, as their joints do"
+        )
+    noise = [each for each in draft.noise if not each[0].startswith("qvel:")]
+    tables = {
+        "fit": {"segments": "whole", "start": "measured"},
+        "controllers": laws,
+        "nuisance": {"bias": {key: True for key, _, _ in noise}},
+    }
+    times = replace(draft.times, rate=1.0 / (max(round(row / timestep), 1) * timestep))
+    return replace(draft, laws=tables, chosen=numbers, times=times, noise=noise)
 
 
 def _candidates(
@@ -783,6 +811,20 @@ def _largest_std(F: Array, members: list[int]) -> float:
     return float(np.sqrt(variances.max()))
 
 
+# Comments that differ in an experiment that shows laws of servos.
+ABOVE_WITH_LAWS = {
+    "controllers": [
+        "The law of each servo, with the numbers of its <position> as guesses.",
+        "Where the servo has a motion profile, state its `acceleration` as well.",
+    ],
+    "parameters": [
+        "In the order in which logs show them: gain and dry friction by the sag under gravity,",
+        "latencies by the begin of motions, kd and damping by the lag, drag by quick motions, the",
+        "largest force by jumps, and armature. Equal servos share numbers.",
+    ],
+    "nuisance": ["Zeros of the readings."],
+}
+
 # Comments above tables and keys.
 ABOVE = {
     "initial.control": ["The control from which a design starts."],
@@ -795,7 +837,8 @@ ABOVE = {
         f"Unknown parameters: at most {MOST_PARAMETERS} that the first motion identifies together,",
         "one for equal joints of a large robot. `mjfim list MODEL` lists every path.",
         "For friction and a delay that the model lacks, add a table [nuisance] with",
-        "friction = true and delay = true, and with the armature of driven joints.",
+        "friction = true and delay = true, and with the armature of driven joints. From logs of",
+        "position servos, `mjfim init MODEL --log LOG --parameters servos` proposes their laws.",
     ],
     "boundary": [
         'end = "rest" lets the motion end at a standstill; "free" gives more information.'
@@ -824,7 +867,7 @@ BEHIND = {
 def experiment_text(proposal: Proposal) -> str:
     """The experiment file of a proposal."""
     model = proposal.compiled
-    above = {**ABOVE, **_about(proposal)}
+    above = {**ABOVE, **_about(proposal), **(ABOVE_WITH_LAWS if proposal.laws else {})}
     behind = {
         **BEHIND,
         **{f"parameters.{each.name}": _meaning(model, each) for each in proposal.chosen},
@@ -832,8 +875,8 @@ def experiment_text(proposal: Proposal) -> str:
     document = tomlkit.document()
     for line in (
         f"A first experiment for {proposal.model}, proposed by `mjfim init`.",
-        "Next: mjfim check FILE says what can be identified,",
-        "mjfim design FILE -o DIR designs the motion that identifies it best.",
+        "Next: mjfim check FILE says what can be identified, check FILE LOG what a log shows.",
+        "mjfim design FILE -o DIR designs the best motion, where the file has no [controllers].",
         "Check what only you know: the noise, the limits, and which parameters you do not trust.",
         *proposal.remarks,
     ):

@@ -101,10 +101,7 @@ targets = [LIMIT_OF_GRIPPER]
 guess = 1.0
 bounds = [0.1, 30.0]
 """
-LIMIT = (
-    '{ path = "controller/JOINT:saturation[1]" }, '
-    '{ path = "controller/JOINT:saturation[0]", scale = -1.0 }'
-)
+LIMIT = '{ path = "controller/JOINT:saturation" }'
 # The profile has the acceleration of the register: 254 times 100 steps/s^2 of 2 pi / 4096 rad. The
 # gripper moves as if it had 20 rad/s^2. Only the chirp shows that, which is not fitted. Jumps of
 # 0.24 rad in one log pass faster than such a profile; all other changes are below 0.08.
@@ -136,19 +133,16 @@ guess = 0.1
 bounds = [0.0, 5.0]
 """
 
-# Changes of the model: motors, what touches the table, and no creep in dry friction, which is 1 to
-# 2 mrad/s with the defaults of MuJoCo.
+# Changes of the model: what touches the table, and no creep in dry friction, which is 1 to 2 mrad/s
+# with the defaults of MuJoCo.
 TOUCHING = 'contype="1" conaffinity="1" friction="0.2"'
 CHANGES = {
-    "<worldbody>": '<option timestep="0.004012" integrator="implicitfast">'
-    '<flag clampctrl="disable"/></option><worldbody>'
+    "<worldbody>": '<option timestep="0.004012" integrator="implicitfast"/><worldbody>'
     f'<geom type="plane" size="1 1 1" pos="0 0 -0.0125" {TOUCHING}/>',
     '<site group="3" name="gripperframe"': '<geom size="0.034" pos="0.024 0 -0.03" mass="0" '
     f'{TOUCHING}/><site group="3" name="gripperframe"',
     '<joint damping="0.60"': '<joint solimpfriction="0.9999 0.9999 0.001" '
     'solreffriction="0.009 1" damping="0.60"',
-    '<position class="sts3215"': "<motor",
-    'forcerange="-3.35 3.35"': "",
 }
 
 

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-import json
+from dataclasses import replace
 from pathlib import Path
 
+import mujoco
+import numpy as np
 import pytest
 
 import mjfim
-from tests.support.cli import done, misused, run
-from tests.support.closed_loop import ARM
+from tests.support.cli import done
+from tests.support.closed_loop import ARM, PlainLaw, simulate
+from tests.support.numerics import require_found
 
 EXPERIMENT = """
 model = "{model}"
@@ -47,27 +50,62 @@ def folder(here: Path) -> Path:
     return here
 
 
-def test_a_closed_loop_is_simulated(folder: Path) -> None:
-    done("simulate arm.toml")
-    header = (folder / "recording.csv").read_text().splitlines()[0].replace('"', "")
-    assert header == "t,reference:shoulder,reference:elbow,qpos:shoulder,qpos:elbow"
+# Numbers of two equal servos and of their joints.
+TRUE = {
+    "kp": 30.0,
+    "shoulder_friction": 0.2,
+    "elbow_friction": 0.1,
+    "shoulder_latency": 0.011,
+    "elbow_latency": 0.018,
+    "kd": 0.5,
+    "shoulder_damping": 0.8,
+    "elbow_damping": 0.4,
+    "shoulder_drag": 0.2,
+    "elbow_drag": 0.1,
+    "armature": 0.03,
+    "bias qpos:shoulder": 0.01,
+    "bias qpos:elbow": -0.02,
+}
 
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("empty_figures")
-def test_an_estimate_says_which_laws_were_in_the_loop(folder: Path) -> None:
-    done("simulate arm.toml")
-    result = done("identify arm.toml recording.csv -o out")
-    plain = " ".join(result.output.split())
-    assert "The control of shoulder is that of its law in the loop, evaluated at 250 Hz" in plain
-    assert "without the control laws of shoulder, elbow" in plain
+def test_the_laws_of_servos_are_proposed_and_found(here: Path) -> None:
+    """A plain loop with motors makes the log; the MJCF has servos with other numbers."""
+    text = ARM.read_text("utf-8").replace('timestep="0.001"', 'timestep="0.004"')
+    text = text.replace('<motor ctrlrange="-20 20"/>', '<position kp="60" kv="2"/>')
+    (here / "arm.xml").write_text(text.replace("<motor", "<position"), "utf-8")
+    model, joints = mujoco.MjModel.from_xml_string(text), ("shoulder", "elbow")
+    model.dof_armature[:] = TRUE["armature"]
+    model.dof_damping[:] = [TRUE[f"{joint}_damping"] for joint in joints]
+    model.dof_dampingpoly[:, 0] = [TRUE[f"{joint}_drag"] for joint in joints]
+    model.dof_frictionloss[:] = [TRUE[f"{joint}_friction"] for joint in joints]
+    rng = np.random.default_rng(0)
+    t = 0.02 * np.arange(200)[:, None]
+    steps = rng.uniform(-0.5, 0.5, (10, 2)).repeat(20, axis=0)
+    goals = steps + 0.3 * np.sin(2.0 * np.pi * t * [0.9, 1.3])
+    law = PlainLaw("", 1, TRUE["kp"], TRUE["kd"], reference_difference=True)
+    laws = {
+        i: replace(law, joint=joint, latency=TRUE[f"{joint}_latency"])
+        for i, joint in enumerate(joints)
+    }
+    columns = {i: {"reference": goals[:, i]} for i in laws}
+    states, _ = simulate(model, laws, columns, 0.02, 200, np.zeros(4))
+    angles = states[:-1, :2] + 1e-3 * rng.standard_normal((200, 2)) + [*TRUE.values()][-2:]
+    header = "t,goal_shoulder,goal_elbow,pos_shoulder,pos_elbow"
+    rows = np.hstack([t, goals, angles])
+    np.savetxt("log.csv", rows, delimiter=",", header=header, comments="")
 
-    found = json.loads((folder / "out" / "estimate.json").read_text())
-    assert [law["actuator"] for law in found["controllers"]] == ["shoulder", "elbow"]
-    assert found["controllers"][0]["numbers"]["kp"] == pytest.approx(60.0, abs=1.0)
-    loaded = mjfim.Estimate.load("out")
-    assert loaded.motion is not None and loaded.motion.ctrl.shape[1] == 2
-    assert "law in the loop" in (folder / "out" / "report.html").read_text()
+    done("init arm.xml --log log.csv --parameters servos")
+    said = " ".join(done("validate arm.toml").output.split())
+    assert "laws in place of 2 position servos" in said
+    said = " ".join(done("identify arm.toml log.csv -o out").output.split())
+    assert "The control of shoulder is that of its law in the loop, evaluated at 250 Hz" in said
+    found = mjfim.Estimate.load("out")
+    assert found.parameters == tuple(TRUE)
+    require_found(found, np.array([*TRUE.values()]))
+    written = mujoco.MjModel.from_xml_path("out/identified.xml")
+    assert written.actuator("elbow").biasprm[1] == pytest.approx(-found["kp"].value)
 
 
 @pytest.mark.usefixtures("folder")
@@ -75,4 +113,3 @@ def test_verbs_say_what_a_file_with_laws_serves() -> None:
     shown = done("validate arm.toml --verbose").output
     assert "It serves `identify` and `simulate`, not `design`" in " ".join(shown.split())
     assert "Control laws in the loop" in shown
-    misused(run("design arm.toml -o new"), "controllers: design needs a control")

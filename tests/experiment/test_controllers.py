@@ -58,6 +58,10 @@ FAULTS: dict[str, tuple[dict[str, Any], str]] = {
         {"parameters": {"k": {"target": "controller/elbow:kp"}}},
         "parameters.k … unknown controller 'elbow' … valid: shoulder",
     ),
+    "no law": (
+        {"controllers": {}, "parameters": {"k": {"target": "controller/elbow:kp"}}},
+        "states no law in [controllers]",
+    ),
     "field of a parameter": (
         {"parameters": {"k": {"target": "controller/shoulder:kv"}}},
         "unknown controller field 'kv' … velocity_time_constant",
@@ -94,11 +98,6 @@ def test_faults_are_named(name: str) -> None:
     message = str(caught.value)
     assert unsaid(parts, message) == []
     assert "\n" not in message
-
-
-def test_without_laws_the_message_about_a_path_says_so() -> None:
-    with pytest.raises(ExperimentError, match=r"states no law in \[controllers\]"):
-        System.resolve(arm_experiment({}, parameters={"k": {"target": "controller/shoulder:kp"}}))
 
 
 @pytest.mark.parametrize("verb", ["design", "check", "compare"])
@@ -138,11 +137,23 @@ def test_laws_follow_the_experiment() -> None:
     assert experiment.packed().controllers == experiment.controllers
 
 
-def test_validation_lists_the_laws() -> None:
-    found = stated_experiment(arm_experiment({"shoulder": PD | {"rate": 250.0}}))
-    (law,) = found.controllers
-    assert (law.actuator, law.rate, law.columns) == ("shoulder", 250.0, ("reference:shoulder",))
-    assert law.is_servo
+def test_a_law_takes_the_place_of_a_position_servo(tmp_path: Path) -> None:
+    """As if the MJCF had motors with its range of force; without kp, a law commands the servo."""
+    text = (MODELS / "two_joint_arm.xml").read_text()
+    servo = 'kp="9" ctrlrange="-1 1" forcerange="-20 20"'
+    text = text.replace("<motor", "<position").replace('ctrlrange="-20 20"', servo)
+    path = tmp_path / "servos.xml"
+    path.write_text(text)
+    laws = dict.fromkeys(("shoulder", "elbow"), PD | {"latency": "3 ms"})
+    control = {"kind": "sine", "amplitude": 0.5, "frequency": 2.0}
+    motor = arm_experiment(laws, horizon=0.4, initial={"control": control})
+    stated = motor.replace(model=str(path))
+    assert np.array_equal(mjfim.simulate(stated).y, mjfim.simulate(motor).y)
+    law, _ = stated_experiment(stated).controllers
+    assert (law.actuator, law.rate, law.columns) == ("shoulder", 500.0, ("reference:shoulder",))
+    assert law.replaces_servo and not stated_experiment(motor).controllers[0].replaces_servo
+    commanded = arm_experiment({"shoulder": {"feedforward": True}}, model=str(path))
+    assert System.resolve(commanded).model.actuator_gainprm[0, 0] == 9.0
 
 
 def test_the_names_of_columns_are_those_of_laws() -> None:
@@ -193,7 +204,7 @@ LOG_FAULTS: dict[str, tuple[tuple[str, ...], dict[str, Any], str]] = {
     "both": (
         (*COLUMNS, "ctrl:shoulder"),
         {},
-        "it holds 'ctrl:shoulder' and 'reference:shoulder' … [controllers.shoulder]",
+        "'ctrl:shoulder': [controllers.shoulder] computes this control",
     ),
     "not read": (
         (*COLUMNS, "feedforward:shoulder"),

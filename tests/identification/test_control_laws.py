@@ -36,20 +36,6 @@ PLANT = {
     "mass": {"target": "body/fore:mass", "true": 1.2, "guess": 1.0},
     "damping": {"target": "joint/elbow:damping", "true": 0.3, "guess": 0.5},
 }
-GAINS: dict[str, Any] = {
-    "kp1": {"target": "controller/shoulder:kp", "true": 60.0, "guess": 50.0, "nuisance": True},
-    "kp2": {"target": "controller/elbow:kp", "true": 30.0, "guess": 25.0, "nuisance": True},
-    "kd2": {"target": "controller/elbow:kd", "true": 1.5, "guess": 1.0, "nuisance": True},
-    "latency": {
-        "targets": (
-            {"path": "controller/shoulder:latency"},
-            {"path": "controller/elbow:latency"},
-        ),
-        "true": 0.0063,
-        "guess": 0.003,
-        "nuisance": True,
-    },
-}
 
 
 def references(samples: int, seed: int, width: int = 2, steps: float = 0.3) -> np.ndarray:
@@ -67,34 +53,13 @@ def log_of(experiment: mjfim.Experiment, samples: int, seed: int) -> Recording:
     return mjfim.simulate(experiment, references(samples, seed, width), seed)
 
 
-def test_plant_gains_and_latency_are_found_from_references_and_feedforward() -> None:
-    laws = {"shoulder": {**SHOULDER, "feedforward": True}, "elbow": ELBOW}
-    experiment = arm_experiment(
-        laws,
-        parameters={**PLANT, **GAINS},
-        noise=NOISE,
-        fit={"bootstrap": 0, "segments": "whole"},
-    )
-    true = System.resolve(experiment).parameters.true
-
-    found = mjfim.identify(experiment, [log_of(experiment, 400, 1)])
-
-    require_found(found, true)
-    assert (found.std < 0.05 * np.abs(true))[[0, 2, 3, 5]].all()
-    shoulder, _ = found.controllers
-    assert shoulder.estimated == ("kp", "latency")
-    assert shoulder.columns == ("reference:shoulder", "feedforward:shoulder")
-
-
 def test_a_limit_that_the_law_hardly_reaches_leaves_the_others_determined(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """It clips the control at the guess, and at the estimate only after a long difference."""
     monkeypatch.setattr("mjfim.identification.fit_problem.SENSITIVITY_STEP", 0.1)
-    ends = [
-        {"path": f"controller/shoulder:saturation[{i}]", "scale": 2.0 * i - 1.0} for i in (0, 1)
-    ]
-    limit = {"targets": ends, "guess": 3.0, "bounds": [1.0, 60.0], "scale": 30.0, "true": 40.0}
+    limit = {"target": "controller/shoulder:saturation", "guess": 3.0, "true": 40.0}
+    limit |= {"bounds": [1.0, 60.0], "scale": 30.0}
     experiment = arm_experiment(
         {"shoulder": SHOULDER, "elbow": ELBOW},
         parameters={**PLANT, "limit": limit},

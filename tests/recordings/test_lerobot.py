@@ -111,9 +111,9 @@ def test_each_episode_is_a_recording(version: str, tmp_path: Path) -> None:
     data = episodes(3)
     folder = write_dataset(tmp_path / "set", data, NAMES, version=version)
     names = [f"episode_{i:06d}" for i in range(3)]
-    paths = recording_paths([folder, tmp_path / "other.csv"], cart().channels)
+    paths = recording_paths([folder, tmp_path / "other.csv"], cart().channels.spec)
     assert [path.name for path in paths] == [*names, "other.csv"]
-    chosen = recording_paths([folder], cart(episodes=[2, 0]).channels)
+    chosen = recording_paths([folder], cart(episodes=[2, 0]).channels.spec)
     assert [path.name for path in chosen] == [names[2], names[0]]
 
     for features, path in zip(data, paths[:3], strict=True):
@@ -129,7 +129,7 @@ def test_each_episode_is_a_recording(version: str, tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match=r"set: has 3 episodes; name one, as in episode_0000"):
         read_columns(folder, ALL)
     with pytest.raises(RecordingError, match="no episode 3; the dataset has the episodes 0 to 2"):
-        recording_paths([folder], cart(episodes=[3]).channels)
+        recording_paths([folder], cart(episodes=[3]).channels.spec)
     with pytest.raises(RecordingError, match="has no "):
         read_columns(folder / "episode_000009", ALL)
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Mapping
 from copy import deepcopy
+from dataclasses import replace
 from datetime import date
 from pathlib import Path
 from typing import Any, TypeVar
@@ -22,8 +23,8 @@ from mjfim.arrays import Array
 from mjfim.errors import ExperimentError, ModelError, OutputError, first_ones, listed
 from mjfim.experiment.packing import input_files
 from mjfim.experiment.schema import Experiment
-from mjfim.experiment.system import System
-from mjfim.model.control_laws import remove_numbers
+from mjfim.experiment.system import System, laws_in_loop
+from mjfim.model.control_laws import is_law_number
 from mjfim.model.elements import element_count, element_name
 from mjfim.model.given import (
     ROUNDING,
@@ -333,8 +334,7 @@ def save_identified(estimate: Estimate, path: str | Path, *, force: bool) -> lis
 
 def identified_spec(estimate: Estimate) -> Any:
     """The identified MjSpec of an estimate. See `Estimate.spec`."""
-    system = _without_floor(_system_of(estimate))
-    wanted = system.model_at(estimate.theta, at_keyframe=False)
+    system, wanted = _expressible(_system_of(estimate), estimate.theta)
 
     def compiled(xml: ModelXml) -> Any:
         """The MjSpec of a text."""
@@ -376,12 +376,29 @@ def _held(system: System) -> dict[str, bytes]:
     }
 
 
-def _without_floor(system: System) -> System:
-    """A system without a floor that only the experiment states, which is no part of the model."""
-    if system.experiment.limits.floor is None:
-        return system
-    bare = system.experiment.replace(limits={"floor": None})
-    return System.resolve(bare, source=system.source.stated)
+def _expressible(system: System, theta: Array) -> tuple[System, Any]:
+    """A system without what is no part of an MJCF, and its model at parameters.
+
+    It has no floor that only the experiment states, and no laws. Servos have the gains of the laws
+    that took their place.
+    """
+    if system.experiment.limits.floor is not None:
+        stated = system.experiment.replace(limits={"floor": None})
+        system = System.resolve(stated, source=system.source.stated)
+    source = system.source.stated.extended(tuple(system.source.terms.values()))
+    parameters = tuple(
+        replace(each, targets=tuple(t for t in each.targets if not is_law_number(t.field)))
+        for each in system.parameters.parameters
+    )
+    own = replace(system.parameters, parameters=parameters)
+    bare = replace(system, source=source, parameters=own)
+    wanted = bare.model_at(theta, at_keyframe=False)
+    for law in laws_in_loop(system, theta, {}):
+        if law.replaces_servo:
+            kp, kd = (law.numbers.get(name, 0.0) for name in ("kp", "kd"))
+            servo = wanted.actuator(law.actuator)
+            servo.gainprm[0], servo.biasprm[1:3] = kp, (-kp, -kd)
+    return bare, wanted
 
 
 def write_identified(
@@ -406,8 +423,7 @@ def write_identified(
     Raises:
         ModelError: No MJCF expresses the values.
     """
-    system = _without_floor(system)
-    wanted = system.model_at(theta, at_keyframe=False)
+    system, wanted = _expressible(system, theta)
     urdfs, remarks = write_identified_urdfs(path, system, theta)
     files = [system.model_path, *(file for file, _ in elements_of(system.model_path))]
     texts = {file.resolve() for file in files}
@@ -443,7 +459,8 @@ def write_identified(
         names = first_ones([law.actuator for law in system.laws.laws], longest=REMARK_TEXT)
         remarks.append(
             f"{path.name}: it holds the model without the control laws of {names}, because MJCF "
-            "has no laws with a rate; estimate.json holds their numbers"
+            "has no laws with a rate; estimate.json holds their numbers. A servo whose place a law "
+            "took has its kp and kd"
         )
     return remarks
 
@@ -506,7 +523,6 @@ def _edited(system: System, theta: Array, wanted: Any, urdfs: dict[Path, Path]) 
 def _printed(system: System, theta: Array, wanted: Any) -> ModelXml:
     """The model as MuJoCo prints it."""
     spec = system.source.spec.copy()
-    remove_numbers(spec)
     for parameter, value in zip(system.parameters.parameters, theta, strict=True):
         if parameter.function is not None:
             parameter.function(spec, float(value))

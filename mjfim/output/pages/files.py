@@ -158,6 +158,9 @@ def _serves(stated: StatedExperiment) -> str:
         "control": len(stated.controls),
     }
     things = [f"{count} {noun}{'s' if count != 1 else ''}" for noun, count in counts.items()]
+    servos = sum(law.replaces_servo for law in stated.controllers)
+    if servos:
+        things.append(f"laws in place of {servos} position servos")
     found = f"{stated.source} is correct: {', '.join(things)}, {stated.rate:g} Hz"
     if stated.missing:
         keys = " and ".join(f"`{key}`" for key in stated.missing)
