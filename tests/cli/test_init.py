@@ -5,11 +5,14 @@ from __future__ import annotations
 import tomllib
 from pathlib import Path
 
+import numpy as np
 import pytest
 from typer.testing import Result
 
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
+from mjfim.recordings.read import read_recording
+from tests.support.cart_pendulum import cart_pendulum, logs_of
 from tests.support.cli import MODELS, done, loads, misused, names, run
 
 MODEL = MODELS / "cart_pendulum.xml"
@@ -18,6 +21,27 @@ MODEL = MODELS / "cart_pendulum.xml"
 def test_a_model_without_joints_is_refused(here: Path) -> None:
     (here / "rigid.xml").write_text("<mujoco/>", encoding="utf-8")
     misused(run("init rigid.xml -o a.toml"), "rigid.xml: the model has no joint")
+
+
+@pytest.mark.slow
+def test_init_reads_a_log_of_another_program(here: Path) -> None:
+    """The experiment file reads the log as it is, and the next command fits it."""
+    (recorded,) = logs_of(cart_pendulum(horizon=1.0), 0)
+    slide, hinge = recorded.y[:-1, :2].T
+    rows = np.column_stack([1e3 * recorded.t[:-1], recorded.ctrl, slide, np.degrees(hinge)])
+    lines = ("; ".join(f"{x:.9f}".replace(".", ",") for x in row) for row in rows)
+    log = Path("robot.csv")
+    log.write_text("\n".join(("time [ms]; force_cmd; x_slide; hinge [deg]", *lines)), "utf-8")
+
+    result = done("init -o robot.toml --log robot.csv", MODEL)
+    assert result.stdout.strip() == "next: mjfim identify robot.toml robot.csv"
+    stated = tomllib.loads(Path("robot.toml").read_text(encoding="utf-8"))["recording"]
+    columns = {"ctrl:force": "force_cmd", "slide_position": "x_slide", "hinge_angle": "hinge"}
+    assert stated == {"time": "time", "columns": columns}
+    read = read_recording(log, System.resolve(Experiment.from_file("robot.toml")).channels)
+    shown = np.column_stack([1e3 * read.t, read.y[:, 0], np.degrees(read.y[:, 1])])
+    assert np.allclose(shown, rows[:, [0, 2, 3]], rtol=0, atol=1e-6)
+    assert run("identify robot.toml robot.csv -o fit").exit_code in (0, 1)
 
 
 def asked(*answers: str, code: int = 0) -> Result:

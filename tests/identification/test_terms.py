@@ -127,7 +127,7 @@ def test_the_missing_term_of_the_library_is_among_the_first(tmp_path: Path, kind
     system = System.resolve(stated)
     problem = FitProblem.of(system, logs)
     at = solution_near(problem, system.parameters.guess)
-    found = find_missing_terms(problem, logs, at).terms
+    found = find_missing_terms(problem, at).terms
 
     # Score tests are linear, so that a selection of terms compares fits with the first ones.
     compared = [t for t in found if t.sigmas**2 >= SIMILAR_SHARE * found[0].sigmas ** 2]
@@ -215,11 +215,11 @@ def test_many_candidates_are_tested_in_groups(
     logs = small_logs(robot, 0)
     problem = FitProblem.of(System.resolve(stated), logs)
     at = solution_near(problem, problem.system.parameters.guess)
-    whole = find_missing_terms(problem, logs, at).terms
+    whole = find_missing_terms(problem, at).terms
     assert "output:delay" in {term.path for term in whole}
 
     monkeypatch.setattr(term_tests, "MAX_TESTED", 4)
-    in_groups = find_missing_terms(problem, logs, at).terms
+    in_groups = find_missing_terms(problem, at).terms
 
     # The last one may be any of several terms with the same effect, here a gain or a payload.
     assert [term.path for term in in_groups[:-1]] == [term.path for term in whole[:-1]]
