@@ -30,7 +30,7 @@ from mjfim.model.coordinates import (
     unknown_coordinate,
 )
 from mjfim.model.loading import ModelSource
-from mjfim.model.units import acts_at_joint, commanded_joint, per_second
+from mjfim.model.units import acts_at_joint, actuator_gear, commanded_joint, per_second
 from mjfim.model.variants import ModelVariant
 from mjfim.plant.outputs import Noise, Output, Outputs
 from mjfim.plant.state_space import StateSpace
@@ -454,6 +454,7 @@ def _numbers(
     number = actuator_names(model).index(actuator)
     has_gain = "kp" in spec.model_fields_set
     is_servo = has_gain and commanded_joint(model, number) == joint.joint
+    is_servo &= actuator_gear(model, number) == 1.0
     # The control of a servo is no force.
     limited, ranges, place = model.actuator_forcelimited, model.actuator_forcerange, number
     if not is_servo:

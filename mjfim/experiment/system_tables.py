@@ -67,8 +67,9 @@ class ControllerSpec(Section):
     is clipped to its range and has the unit of the actuator, which is called u here. Unknown
     numbers are parameters, with the target `controller/<actuator>:kp` for example.
 
-    A law that states `kp` takes the place of a `<position>` servo at its joint: the actuator is a
-    motor then, without the ranges of the servo. Other laws compute the control of the servo.
+    A law that states `kp` takes the place of a `<position>` servo without gear at its joint: the
+    actuator is a motor then, without the ranges of the servo. Other laws compute the control of
+    the servo.
     """
 
     kind: Literal["torque", "voltage", "current"] | None = Field(

@@ -489,8 +489,8 @@ class FitSpec(Section):
     seconds: Seconds | None = Field(
         default=None,
         description=(
-            "Total length of the fitted segments [s], which are spread over the recordings. "
-            "Default: all segments."
+            "Total length of the fitted segments [s], which are spread over the recordings. It "
+            "needs a length in `segments`. Default: all segments."
         ),
     )
     hold: tuple[str, ...] = Field(
@@ -559,6 +559,13 @@ class FitSpec(Section):
         le=MAX_REPLICATES,
         description="Number of bootstrap replicates. 0: no bootstrap.",
     )
+
+    @model_validator(mode="after")
+    def _segments_of_seconds(self) -> FitSpec:
+        """Refuse a total length of segments that have no length."""
+        if self.seconds is not None and self.segment_length is None:
+            raise ValueError("seconds needs a length of the segments: state segments, such as 1.0")
+        return self
 
     @property
     def segment_length(self) -> float | None:

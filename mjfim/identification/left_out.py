@@ -254,11 +254,9 @@ def fit_without(
     # The data that are left out may have led the estimate to a minimum that the others lack.
     guess = others.begin(problem.parameters.guess)
     starts.append((others.cost(guess), guess))
-    # Of long logs, a search takes long, and the end of the best step is near enough. The estimate
-    # itself would contain what is left out.
-    is_long = problem.system.experiment.fit.seconds is not None
-    best = min(starts[int(is_long) :], key=lambda start: start[0])[1]
-    if is_long:
+    # Of long logs, a search takes long, and the end of a step that lowers the cost is near enough.
+    least, best = min(starts, key=lambda start: start[0])
+    if problem.system.experiment.fit.seconds is not None and least < cost:
         return None if budget.exhausted is not None else best
     found = minimise(others, best, SEARCH, budget)
     return None if found is None or budget.exhausted is not None else found.unknowns

@@ -164,8 +164,9 @@ def with_length(
     Args:
         task: The task.
         length: The length [s], or "whole"; None for a length that the fit chooses.
-        seconds: Total length of the segments that are fitted [s]; None for all.
+        seconds: Total length of the segments that are fitted [s]; None for the one of the task.
     """
+    seconds = seconds or task.settings.seconds
     settings = task.settings.model_copy(update={"segments": length, "seconds": seconds})
     experiment = task.system.experiment.model_copy(update={"fit": settings})
     return replace(task, system=replace(task.system, experiment=experiment))

@@ -201,9 +201,9 @@ def with_laws(source: ModelSource, numbers: Mapping[str, Mapping[str, float]]) -
             spec.add_numeric(name=f"{PREFIX}{actuator}", size=len(data), data=list(data))
             if numbers[actuator]["servo"]:
                 motor = spec.actuator(actuator)
-                lag = motor.dyntype
+                lag, numbers_of_lag = motor.dyntype, motor.dynprm.copy()
                 motor.set_to_motor()
-                motor.dyntype = lag
+                motor.dyntype, motor.dynprm = lag, numbers_of_lag
                 # Its control was a position, and the law has the range of its force.
                 motor.ctrllimited = motor.forcelimited = mujoco.mjtLimited.mjLIMITED_FALSE
 

@@ -537,7 +537,10 @@ def _servo_field(model: Any, path: ParameterPath, actuator: int) -> ModelField:
         follower = ("actuator_biasprm", actuator, column, -1.0)
         return ModelField(array="actuator_gainprm", rows=rows, column=0, followers=(follower,))
     wanted = "position" if path.field == "kp" else "position or velocity"
-    raise path.error(f"the actuator is no {wanted} servo; use gainprm[i] and biasprm[i]")
+    raise path.error(
+        f"the actuator is no {wanted} servo; use gainprm[i] and biasprm[i], or the numbers of the "
+        "law that takes its place"
+    )
 
 
 def _array_field(model: Any, path: ParameterPath, number: int) -> ModelField:

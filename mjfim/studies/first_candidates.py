@@ -32,7 +32,7 @@ from mjfim.model.inertia import body_inertia
 from mjfim.model.loading import NO_PACKAGES, ModelSource, load_spec
 from mjfim.model.model_files import PACKAGE
 from mjfim.model.paths import matches, unit_of
-from mjfim.model.units import commanded_joint, servo_kind
+from mjfim.model.units import actuator_gear, commanded_joint, servo_kind
 from mjfim.studies import EVERY_GROUP, GROUPS, Group
 
 # Comment at the head of the MJCF.
@@ -349,6 +349,10 @@ FIRST_LATENCY = 0.5
 # of many models are much stiffer than real ones. The gain kd answers a change with kp at most.
 LEAST_ERROR = 0.1
 
+# Upper bound of the largest force, over that of the model. A force that no motion reaches would
+# grow without end.
+LARGEST_FORCE = 10.0
+
 
 def servo_laws(
     model: Any, period: float, row: float
@@ -369,16 +373,18 @@ def servo_laws(
         for each in _joint_fields(model, group, period)
     }
     laws: dict[str, dict[str, Any]] = {}
-    servos, alike = [], dict[str, int]()
+    servos, alike, driven = [], dict[str, int](), set[str]()
     for i in range(model.nactuator):
         actuator, number = element_name(model, "actuator", i), commanded_joint(model, i)
         joint = "" if number is None else element_name(model, "joint", number)
-        if not actuator or not joint:
+        if not actuator or not joint or actuator_gear(model, i) != 1.0 or joint in driven:
             continue
+        driven.add(joint)
         kp, kd = float(model.actuator_gainprm[i, 0]), -float(model.actuator_biasprm[i, 2])
         limits = {}
-        if model.actuator_forcelimited[i]:
-            limits = {"saturation": model.actuator_forcerange[i].tolist()}
+        low, high = model.actuator_forcerange[i].tolist()
+        if model.actuator_forcelimited[i] and low == -high:
+            limits = {"saturation": [low, high]}
             size = position_sizes(model)[model.jnt_dofadr[number]]
             kp = min(kp, rounded(limits["saturation"][1] / (LEAST_ERROR * size)))
         law = laws[actuator] = {
@@ -392,6 +398,11 @@ def servo_laws(
         first = alike.setdefault(f"{law} {fields[f'joint/{joint}:armature'].value}", i)
         servos.append((actuator, joint, i, first))
 
+    upper = {
+        name: LARGEST_FORCE * law["saturation"][1]
+        for name, law in laws.items()
+        if "saturation" in law
+    }
     found = [
         Candidate(
             name=f"{actuator}_{name}",
@@ -401,11 +412,11 @@ def servo_laws(
             owners=(actuator,),
             family=first if name in SHARED else i,
             scale=None if "joint" not in path else fields[path.format(actuator, joint)].scale,
-            bounds=(0.0, np.inf) if name in ("drag", "duty") else None,
+            bounds={"drag": (0.0, np.inf), "duty": (0.0, upper.get(actuator, np.inf))}.get(name),
         )
         for name, path, quantity in OF_SERVOS
         for actuator, joint, i, first in servos
-        if name != "duty" or "saturation" in laws[actuator]
+        if name != "duty" or actuator in upper
     ]
     return laws, _tied(model, found)
 

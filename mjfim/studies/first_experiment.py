@@ -25,6 +25,7 @@ from mjfim.errors import (
     ModelWarning,
     SimulationDivergedError,
     first_ones,
+    listed,
 )
 from mjfim.excitation.limits.limits import limits_of_model
 from mjfim.excitation.limits.verification import verify, violations_of
@@ -380,6 +381,12 @@ def propose_experiment(
 
 def _with_laws(draft: Proposal, wishes: Wishes) -> Proposal:
     """The draft with the laws of position servos, which a log is to show."""
+    others = sorted({*wishes.groups} - {"servos", "friction", "motors"})
+    if others or wishes.payload is not None:
+        raise ExperimentError(
+            "parameters: servos proposes the laws of servos alone; leave out "
+            f"{listed(others or ['payload'])}"
+        )
     timestep, row = draft.compiled.opt.timestep, wishes.row or 0.0
     laws, numbers = servo_laws(draft.compiled, draft.times.period, row)
     if not row or not laws:
@@ -391,7 +398,7 @@ def _with_laws(draft: Proposal, wishes: Wishes) -> Proposal:
     tables = {
         "fit": {"segments": "whole", "start": "measured"},
         "controllers": laws,
-        "nuisance": {"bias": {key: True for key, _, _ in noise}},
+        "nuisance": {"bias": {key: True for key, _, _ in noise if key.startswith("qpos:")}},
     }
     times = replace(draft.times, rate=1.0 / (max(round(row / timestep), 1) * timestep))
     return replace(draft, laws=tables, chosen=numbers, times=times, noise=noise)
@@ -875,8 +882,8 @@ def experiment_text(proposal: Proposal) -> str:
     document = tomlkit.document()
     for line in (
         f"A first experiment for {proposal.model}, proposed by `mjfim init`.",
-        "Next: mjfim check FILE says what can be identified, check FILE LOG what a log shows.",
-        "mjfim design FILE -o DIR designs the best motion, where the file has no [controllers].",
+        "Next: mjfim check FILE LOG says what a log shows, check FILE what can be identified.",
+        "mjfim design FILE -o DIR designs the best motion. The last two need no [controllers].",
         "Check what only you know: the noise, the limits, and which parameters you do not trust.",
         *proposal.remarks,
     ):

@@ -71,6 +71,9 @@ WORSE_ERROR_RATIO = 1.02
 MAX_STEPS = 100_000
 MIN_SEGMENTS = 20
 
+# Fewest samples of such a segment: fewer show little besides the free initial state.
+MIN_SAMPLES = 12
+
 # Largest number of final fits, each of which may show further terms.
 MAX_FINAL_FITS = 3
 
@@ -100,6 +103,7 @@ def select_terms(
 ) -> Estimate:
     """Estimate parameters, and extend the model by the terms that the recordings show it to lack.
 
+    Of long recordings, segments are fitted that are spread over them, and a warning says so.
     `estimate.selection` says which terms were added and why. Parameters that the recordings hardly
     determine are pooled, or held at their guess, where left-out data are predicted as well without
     them. The experiment of the selected model is `mjfim.selected_experiment(experiment,
@@ -193,11 +197,16 @@ class _Selector:
         """The task on as many segments, spread over the recordings, as a selection can fit."""
         problem = task.problem()
         simulations = 1 + problem.column_count + problem.private_count
-        samples = MAX_STEPS // (simulations * problem.system.grid.substeps)
-        if problem.sample_count <= samples:
-            return task
         dt, whole = problem.system.dt, problem.sample_count
-        seconds, length = samples * dt, task.settings.segment_length
+        length = task.settings.segment_length
+        least = MIN_SAMPLES if length is None else round(length / dt)
+        samples = MAX_STEPS // (simulations * problem.system.grid.substeps)
+        samples = max(samples, MIN_SEGMENTS * least)
+        # Segments have free initial states, which parameters cannot move.
+        is_moved = problem.system.plant.initial_state_derivative.any()
+        if whole <= samples or is_moved:
+            return task
+        seconds = samples * dt
         task = with_length(task, length or seconds / MIN_SEGMENTS, seconds)
         task = replace(task, predicts_whole=length is None)
         problem = task.problem()

@@ -155,6 +155,13 @@ def test_a_law_takes_the_place_of_a_position_servo(tmp_path: Path) -> None:
     commanded = arm_experiment({"shoulder": {"feedforward": True}}, model=str(path))
     assert System.resolve(commanded).model.actuator_gainprm[0, 0] == 9.0
 
+    # A motor keeps the time constant of the servo. A law over a geared servo commands it.
+    text = text.replace("<position", '<position timeconst="0.05"', 1)
+    path.write_text("<position gear='2'".join(text.rsplit("<position", 1)))
+    model = System.resolve(stated).model
+    assert model.actuator_dynprm[0, 0] == 0.05
+    assert model.actuator_gainprm[:, 0].tolist() == [1.0, 9.0]
+
 
 def test_the_names_of_columns_are_those_of_laws() -> None:
     assert tuple(f"{quantity}:" for quantity in get_args(Quantity)) == LAW_PREFIXES

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import mjfim
+from mjfim.errors import ExperimentError
 from mjfim.experiment.system import System
 from mjfim.identification.assessment import term_tests
 from mjfim.identification.assessment.term_tests import (
@@ -86,6 +87,9 @@ def test_a_fit_to_some_seconds_has_segments_of_all_recordings(tmp_path: Path) ->
     assert {segment.recording for segment in segments} == {0, 1, 2}
     assert sum(segment.samples for segment in segments) == 1.5 * RATE
 
+    with pytest.raises(ExperimentError, match="seconds needs a length of the segments"):
+        experiment.replace(fit={"segments": "whole"})
+
     low, high = mjfim.identify(experiment, logs).interval.T
     assert ((low < system.parameters.true) & (system.parameters.true < high)).all()
 
@@ -123,4 +127,4 @@ def test_an_estimate_and_a_selection_say_on_how_much_terms_were_tested(
     # Of much data, segments are fitted that are spread over them.
     monkeypatch.setattr(selection, "MAX_STEPS", 2_000)
     found = mjfim.select_terms(experiment, logs)
-    assert found.warnings[0].startswith("only 20 segments, 1")
+    assert found.warnings[0].startswith("only 20 segments, 2.33 of 4 s")

@@ -393,9 +393,11 @@ def _expressible(system: System, theta: Array) -> tuple[System, Any]:
     own = replace(system.parameters, parameters=parameters)
     bare = replace(system, source=source, parameters=own)
     wanted = bare.model_at(theta, at_keyframe=False)
+    motors = system.plant.model(theta)
     for law in laws_in_loop(system, theta, {}):
         if law.replaces_servo:
-            kp, kd = (law.numbers.get(name, 0.0) for name in ("kp", "kd"))
+            gain = motors.actuator(law.actuator).gainprm[0]
+            kp, kd = (gain * law.numbers.get(name, 0.0) for name in ("kp", "kd"))
             servo = wanted.actuator(law.actuator)
             servo.gainprm[0], servo.biasprm[1:3] = kp, (-kp, -kd)
     return bare, wanted
@@ -460,7 +462,7 @@ def write_identified(
         remarks.append(
             f"{path.name}: it holds the model without the control laws of {names}, because MJCF "
             "has no laws with a rate; estimate.json holds their numbers. A servo whose place a law "
-            "took has its kp and kd"
+            "took has its kp and kd, but neither its latency nor its largest force"
         )
     return remarks
 
