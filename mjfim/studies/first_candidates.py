@@ -309,7 +309,8 @@ def candidates(
     Raises:
         ExperimentError: The body of the payload does not exist, or has no mass.
     """
-    friction, drives, _ = (list(_joint_fields(model, group, period)) for group in JOINT_FIELDS)
+    friction = list(_joint_fields(model, "friction", period))
+    drives = list(_joint_fields(model, "motors", period))
     found = list(_servos(model))
     found += [*friction, *drives, _delay(rate)] if found else []
     # The last body carries what the robot grasps. With a stated payload, its mass is known.
@@ -386,7 +387,7 @@ def servo_laws(
         if model.actuator_forcelimited[i] and low == -high:
             limits = {"saturation": [low, high]}
             size = position_sizes(model)[model.jnt_dofadr[number]]
-            kp = min(kp, rounded(limits["saturation"][1] / (LEAST_ERROR * size)))
+            kp = min(kp, rounded(high / (LEAST_ERROR * size)))
         law = laws[actuator] = {
             "kp": kp,
             "kd": kd if 0.0 < kd < kp * row else rounded(kp * row),

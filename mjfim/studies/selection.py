@@ -28,6 +28,7 @@ from mjfim.identification.fit_workers import FitWorkers
 from mjfim.identification.identify import Callback, fit_task, is_doubtful, refit_task
 from mjfim.identification.left_out import held_out_losses
 from mjfim.identification.search import FitSearch, FitTask, with_length
+from mjfim.identification.starts import MIN_ROWS
 from mjfim.parallel import ExecutorLike, one_blas_thread
 from mjfim.parallel.budget import Budget, StopToken, stop_on_interrupt
 from mjfim.records.estimate import Estimate
@@ -70,9 +71,6 @@ WORSE_ERROR_RATIO = 1.02
 # recordings, and the least number of these segments. A selection makes a hundred linearisations.
 MAX_STEPS = 100_000
 MIN_SEGMENTS = 20
-
-# Fewest samples of such a segment: fewer show little besides the free initial state.
-MIN_SAMPLES = 12
 
 # Largest number of final fits, each of which may show further terms.
 MAX_FINAL_FITS = 3
@@ -199,7 +197,7 @@ class _Selector:
         simulations = 1 + problem.column_count + problem.private_count
         dt, whole = problem.system.dt, problem.sample_count
         length = task.settings.segment_length
-        least = MIN_SAMPLES if length is None else round(length / dt)
+        least = MIN_ROWS if length is None else round(length / dt)
         samples = MAX_STEPS // (simulations * problem.system.grid.substeps)
         samples = max(samples, MIN_SEGMENTS * least)
         # Segments have free initial states, which parameters cannot move.
