@@ -6,10 +6,9 @@ Commands do not depend on the state, so that they are computed for all ticks bef
     r_f,k  = r_f,k-1 + a (r(t_k) - r_f,k-1),     a = 1 - exp(-T / tau)
 
 with the latency d, the period T of the law, and the time constant tau. The width w is that of a
-tick, at most a sample: a held command that arrives inside a tick counts for the rest of the tick.
-So r depends continuously on d. References that are points of a continuous signal are interpolated
-linearly, which is w = one sample. A motion profile with the acceleration a goes to r_f in the
-shortest time, and takes its place:
+tick, at most a sample. References that are points of a continuous signal are interpolated linearly,
+which is w = one sample. A motion profile with the acceleration a goes to r_f in the shortest time,
+and takes its place:
 
     w_k = min(sqrt((a T / 2)^2 + 2 a |e_k|) - a T / 2, |e_k| / T),     e_k = r_f,k - p_k-1
     s_k = s_k-1 + (w_k sgn(e_k) - s_k-1 inside +-a T),     p_k = p_k-1 + T s_k
@@ -20,7 +19,11 @@ At a tick k, with the measured position q and velocity v, and the commands of th
     u_k = g (kp (r_k - q) + kd (rdot_k - v)) + I_k + f_k
 
 is clipped to the range of the control, then to the largest change since the last tick. The factor g
-and the feed-forward f come from the log. The measurement is that of the model, late by the latency
+and the feed-forward f come from the log. A held command that arrives inside a tick acts in the rest
+of it: commands are late by whole ticks, and the control is the mean of u_k with the commands of
+this tick and with those of the tick before, weighted by their parts of the tick. The mean of the
+commands instead would let a small part of a step cause the largest control, so that the motion
+would not depend on d between two ticks. The measurement is that of the model, late by the latency
 of the feedback: positions between two ticks follow the cubic polynomial through their positions and
 velocities, velocities a straight line, so that they depend continuously on the latency.
 """
@@ -156,7 +159,9 @@ class LawCommands:
 
     Attributes:
         before: Number of evaluations before the first one of the curves.
-        reference: (K, m, c) references, filtered and after the motion profile [m or rad].
+        rest: (m, c) parts of a tick by which commands are later than whole ticks.
+        reference: (K, m, c) references, filtered and after the motion profile, late by whole ticks
+            [m or rad].
         profile_velocity: (K, m, c) velocities of the motion profiles [m/s or rad/s].
         reference_velocity: (K, m, c) velocities of the references [m/s or rad/s], or None.
         feedforward: (K, m, c) controls that are added [u-unit], or None.
@@ -168,6 +173,7 @@ class LawCommands:
     """
 
     before: int
+    rest: Array
     reference: Array
     profile_velocity: Array
     reference_velocity: Array | None
@@ -176,6 +182,11 @@ class LawCommands:
     enabled: Array | None
     lag: Array
     lag_time: Array
+
+    def velocity_at(self, tick: int) -> Array:
+        """(m, c) velocities of the references at a tick, 0 where laws have none."""
+        known = self.reference_velocity
+        return np.zeros_like(self.rest) if known is None else known[tick]
 
     @classmethod
     def of(
@@ -202,34 +213,40 @@ class LawCommands:
         latency = numbers.latency / (ticks.substeps * ticks.timestep)
         shares = filter_shares(numbers.time_constant, ticks.seconds)
 
-        received = columns.at("reference", columns.places - latency)
-        filtered = _filtered(received, shares)
+        has_profile = np.isfinite(numbers.acceleration)
+        late_ticks = numbers.latency / ticks.seconds
+        rest = np.where(has_profile | columns.are_held, late_ticks % 1.0, 0.0)
+        begins = columns.places - (latency - rest * ticks.period / ticks.substeps)
+        filtered = _filtered(columns.at("reference", begins), shares)
         reference, slope = filtered, np.broadcast_to(0.0, filtered.shape)
-        if np.isfinite(numbers.acceleration).any():
-            jumps = columns.changes("reference", columns.places - latency) > numbers.jump
+        if has_profile.any():
+            jumps = columns.changes("reference", begins) > numbers.jump
             # A command that arrives inside a tick counts in part there, and in full in the next.
             jumps[1:] |= jumps[:-1].copy()
             reference, slope = _profiled(filtered, jumps, numbers, ticks, memory)
-        velocity = columns.late("reference_velocity", latency)
+        velocity = columns.if_read("reference_velocity", begins)
         if velocity is not None:
             velocity = _filtered(velocity, shares)
         velocity = _with_differences(laws, velocity, reference, ticks.seconds)
+        if memory is not None and ticks.before and velocity is not None:
+            velocity[ticks.before - 1] = memory.reference_velocity
 
         # Sums over ticks hold back what the reference was, on average, half a latency before the
         # middle of the latest tick.
         begin = -0.5 * ticks.period / ticks.substeps
         middle = columns.at("reference", lead + begin - 0.5 * latency[None])
         kept_back = ticks.seconds * (1.0 - shares) / shares
-        latest = filtered[max(ticks.before - 1, 0)]
-        behind = (filtered - reference)[: ticks.before].sum(axis=0)
+        latest = _earlier(filtered, rest)[max(ticks.before - 1, 0)]
+        behind = _earlier(filtered - reference, rest)[: ticks.before].sum(axis=0)
 
         enabled = columns.at_once("enable")
         return cls(
             before=ticks.before,
+            rest=rest,
             reference=reference,
             profile_velocity=slope,
             reference_velocity=velocity,
-            feedforward=columns.late("feedforward", latency),
+            feedforward=columns.if_read("feedforward", begins),
             gain=columns.at_once("gain"),
             enabled=None if enabled is None else np.where(enabled >= ON, 1.0, 0.0),
             lag=numbers.latency * middle[0] + kept_back * latest + ticks.seconds * behind,
@@ -264,6 +281,12 @@ class _Columns:
         tick = min(self.ticks.period / self.ticks.substeps, 1.0)
         return np.array([1.0 if law.interpolated else tick for law in self.laws])
 
+    @property
+    def are_held(self) -> np.ndarray:
+        """(c,) True for laws whose commands are held for whole ticks."""
+        is_short = self.ticks.period <= self.ticks.substeps
+        return np.array([is_short and not law.interpolated for law in self.laws])
+
     def at(self, quantity: Quantity, places: Array) -> Array:
         """(K, m, c) means of a quantity, 0 for laws that do not read it.
 
@@ -293,11 +316,11 @@ class _Columns:
     def _following(self, sample: np.ndarray) -> np.ndarray:
         return np.asarray(np.minimum(sample + 1, self.window.shape[1] - 1))
 
-    def late(self, quantity: Quantity, latency: Array) -> Array | None:
-        """(K, m, c) quantity at the ticks, late by (m, c) samples; None where no law reads it."""
+    def if_read(self, quantity: Quantity, places: Array) -> Array | None:
+        """What `at` returns; None where no law reads the quantity."""
         if not any(quantity in law.columns for law in self.laws):
             return None
-        return self.at(quantity, self.places - latency)
+        return self.at(quantity, places)
 
     def at_once(self, quantity: Quantity) -> Array | None:
         """(K, m, c) quantity at the ticks, without latency, 1 for laws that do not read it.
@@ -358,6 +381,11 @@ def _filtered(values: Array, shares: Array) -> Array:
         settled = (1.0 - share) * x[:1]
         filtered[:, chosen], _ = scipy.signal.lfilter(numerator, denominator, x, axis=0, zi=settled)
     return filtered
+
+
+def _earlier(values: Array, part: Array | float = 1.0) -> Array:
+    """Values: (K, m, c) of which a part: (m, c) is that of the tick before."""
+    return values - part * np.diff(values, axis=0, prepend=values[:1])
 
 
 def _profiled(
@@ -433,6 +461,7 @@ class LawMemory:
     Attributes:
         held: (m, c) controls that the laws hold [u-unit].
         reference: (m, c) references at the latest evaluation [m or rad].
+        reference_velocity: (m, c) velocities of the references [m/s or rad/s].
         profile_velocity: (m, c) velocities of the motion profiles [m/s or rad/s].
         integral: (m, c) integrals [u-unit].
         velocity: (m, c) filtered velocities [m/s or rad/s].
@@ -443,6 +472,7 @@ class LawMemory:
 
     held: Array
     reference: Array
+    reference_velocity: Array
     profile_velocity: Array
     integral: Array
     velocity: Array
@@ -479,7 +509,7 @@ def distinct_curves(
     read = sorted({column for law in laws for column in law.columns.values()})
     deciding = [window[:, :, read], *(getattr(numbers, name) for name in DECIDING_NUMBERS)]
     if memory is not None:
-        deciding += [memory.reference, memory.profile_velocity]
+        deciding += [memory.reference, memory.reference_velocity, memory.profile_velocity]
     keys = [b"".join(part.tobytes() for part in parts) for parts in zip(*deciding, strict=True)]
     firsts = {key: curve for curve, key in reversed(list(enumerate(keys)))}
     places = {key: place for place, key in enumerate(firsts)}
@@ -590,11 +620,14 @@ class RunningLaws:
         drive = numbers.kp * commands.reference
         if commands.reference_velocity is not None:
             drive += numbers.kd * commands.reference_velocity
-        if commands.gain is not None:
-            drive *= commands.gain
-        if commands.feedforward is not None:
-            drive += commands.feedforward
-        self._drive = drive
+        gain = 1.0 if commands.gain is None else commands.gain
+        feedforward = commands.feedforward
+        added = np.zeros_like(drive) if feedforward is None else feedforward
+        self._drive = self._earlier = gain * drive + added
+        self._has_rest = bool(commands.rest.any())
+        if self._has_rest:
+            self._earlier = gain * _earlier(drive) + _earlier(added)
+        self._reference = _earlier(commands.reference, commands.rest)
         self._next = ticks.before
 
         seconds = ticks.seconds
@@ -612,6 +645,9 @@ class RunningLaws:
         self._is_slow = bool(np.isfinite(numbers.slew).any())
         self._filters = bool((self._velocity_share < 1.0).any())
         self._is_late = bool(numbers.feedback_latency.any())
+        if self._has_rest and not self._has_limits:
+            self._drive = self._drive + commands.rest * (self._earlier - self._drive)
+            self._has_rest = False
 
         self.held = memory.held
         self.is_clipped = np.zeros(memory.held.shape, dtype=bool)
@@ -633,6 +669,7 @@ class RunningLaws:
         return LawMemory(
             held=self.held,
             reference=self._commands.reference[latest],
+            reference_velocity=self._commands.velocity_at(latest),
             profile_velocity=self._commands.profile_velocity[latest],
             integral=self._integral,
             velocity=self._velocity,
@@ -657,19 +694,16 @@ class RunningLaws:
 
         numbers, commands = self._numbers, self._commands
         gain = 1.0 if commands.gain is None else commands.gain[tick]
-        control: Array = self._drive[tick] - gain * (numbers.kp * q + numbers.kd * v)
+        kept = -gain * (numbers.kp * q + numbers.kd * v)
         if self._integrates:
-            step = gain * (self._integral_step * (commands.reference[tick] - q))
+            step = gain * (self._integral_step * (self._reference[tick] - q))
             limit = numbers.integral_limit
             self._integral = _clipped(self._integral + step, -limit, limit)
-            control += self._integral
-        if self._has_limits:
-            limited = _clipped(control, numbers.saturation_low, numbers.saturation_high)
-            if self._is_slow and self._has_held:
-                change = self._largest_change
-                limited = _clipped(limited, self.held - change, self.held + change)
-            self.is_clipped = limited != control
-            control = limited
+            kept = kept + self._integral
+        control = self._limited(self._drive[tick] + kept)
+        if self._has_rest:
+            earlier = self._limited(self._earlier[tick] + kept)
+            control = control + commands.rest * (earlier - control)
 
         # A driver that is off forgets its integral.
         if commands.enabled is not None:
@@ -680,6 +714,17 @@ class RunningLaws:
         self.held = control
         self._has_held = True
         return control
+
+    def _limited(self, control: Array) -> Array:
+        """The control: (m, c) inside its range, and near that of the tick before."""
+        if not self._has_limits:
+            return control
+        limited = _clipped(control, self._numbers.saturation_low, self._numbers.saturation_high)
+        if self._is_slow and self._has_held:
+            change = self._largest_change
+            limited = _clipped(limited, self.held - change, self.held + change)
+        self.is_clipped = limited != control
+        return limited
 
     def _measure(self, q: Array, v: Array) -> tuple[Array, Array]:
         """Positions and velocities that the driver uses, from those of the joints now."""
@@ -780,6 +825,7 @@ def memory_at_begin(
     return LawMemory(
         held=np.zeros_like(q),
         reference=commands.reference[latest],
+        reference_velocity=commands.velocity_at(latest),
         profile_velocity=commands.profile_velocity[latest],
         integral=integral,
         velocity=v,

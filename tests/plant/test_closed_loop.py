@@ -38,9 +38,16 @@ LAWS: dict[str, dict[str, Any]] = {
         "jump": 0.3,
         "reference_velocity": "difference",
         "time_constant": 0.002,
-        "latency": 0.005,
+        "latency": 0.0053,
     },
-    "profile of all changes": {"kp": 60.0, "kd": 4.0, "acceleration": 60.0, "latency": 0.003},
+    "profile of all changes": {
+        "kp": 60.0,
+        "kd": 4.0,
+        "rate": 250.0,
+        "acceleration": 60.0,
+        "latency": 0.0033,
+        "reference_velocity": "difference",
+    },
     "late feedback": {"kp": 40.0, "kd": 1.0, "rate": 250.0, "feedback_latency": 0.0063},
     "differences": {
         "kp": 40.0,
@@ -52,7 +59,7 @@ LAWS: dict[str, dict[str, Any]] = {
         "reference_velocity": "difference",
     },
     "integral": {"kp": 40.0, "kd": 3.0, "ki": 200.0, "integral": 1.5, "integral_limit": 4.0},
-    "limited": {"kp": 60.0, "kd": 4.0, "saturation": (-3.0, 5.0), "slew": 150.0, "rate": 250.0},
+    "limited": {"kp": 60.0, "kd": 4.0, "saturation": (-3.0, 5.0), "slew": 150.0, "latency": 0.0033},
     "columns": {
         "kp": 20.0,
         "kd": 2.0,
@@ -128,9 +135,11 @@ def test_a_law_equals_a_plain_loop(name: str) -> None:
     assert np.abs(expected - oracle(system, {"kp": 0.0}, inputs)).max() > 0.05
 
 
-def test_a_jump_passes_at_any_latency() -> None:
-    """The motion is continuous in the latency, wherever the jump arrives inside a tick."""
-    law = {"kp": 50.0, "kd": 4.0, "rate": 250.0, "acceleration": 39.0, "jump": 0.15}
+@pytest.mark.parametrize("jump", [0.15, np.inf])
+def test_a_step_has_its_effect_at_any_latency(jump: float) -> None:
+    """The motion is continuous in the latency, wherever the step arrives inside a tick."""
+    law = {"kp": 50.0, "kd": 4.0, "rate": 250.0, "acceleration": 39.0}
+    law |= {"jump": jump} if np.isfinite(jump) else {}
     system = System.resolve(arm_experiment({"shoulder": law}))
     inputs = np.zeros((SAMPLES, 2))
     inputs[20:, 0] = 0.24
@@ -144,9 +153,10 @@ def test_a_jump_passes_at_any_latency() -> None:
     starts, logs = np.zeros((m, 4)), np.repeat(inputs[None], m, axis=0)
     q = system.plant.simulator.rollout(models, starts, logs).states[:, 45, 0]
 
-    # All of the step acts at once: a profile alone would need 0.16 s.
-    assert q.min() > 0.015
+    # A jump acts at once: a profile needs 0.16 s.
+    assert (q.min() > 0.015) == np.isfinite(jump)
     assert np.abs(np.diff(q)).max() < 0.15 * np.ptp(q)
+    assert np.diff(q).max() < 0.5 * np.diff(q).min()
 
 
 def test_simulations_of_one_batch_have_their_own_numbers() -> None:

@@ -109,25 +109,28 @@ def controls_of(
     width = dt if law.linear else min(T, dt)
     share = 1.0 - math.exp(-T / law.time_constant) if law.time_constant else 1.0
     rows = signals["reference"]
+    # The control is that of commands late by whole ticks, and for the rest that of the tick before.
+    by_ticks = math.isfinite(law.acceleration) or (dt + 1e-12 >= T and not law.linear)
+    rest = (law.latency / T) % 1.0 if by_ticks else 0.0
+    late = law.latency - rest * T
 
     # What is known before the first tick: the joint has always moved at its first velocity.
     q, v = start
     times, positions, velocities = [-1.0, 0.0], [q - v, q], [v, v]
     last_position = q - v * (T + law.feedback_latency)
     filtered_velocity, integral = v, law.integral
-    filtered = profile = last_row = held = reference_velocity = None
+    filtered = profile = last_row = held = reference_velocity = last_goal = None
     speed, has_jumped, u = 0.0, False, 0.0
 
     while True:
         t, q, v = yield u
-        r = command(t - law.latency, rows, dt, width)
+        r = command(t - late, rows, dt, width)
         previous = r if filtered is None else filtered
         filtered = reference = previous + share * (r - previous)
         if math.isfinite(law.acceleration):
-            is_first = profile is None
-            before = reference if is_first else profile
+            before = reference if profile is None else profile
             # The latest row of the log that counts at this tick; a jump counts at two ticks.
-            latest = math.ceil((t - law.latency + width) / dt - 1e-9) - 1
+            latest = math.ceil((t - late + width) / dt - 1e-9) - 1
             row = rows[min(max(latest, 0), len(rows) - 1)]
             jumps = last_row is not None and abs(row - last_row) > law.jump
             if jumps or has_jumped:
@@ -140,14 +143,20 @@ def controls_of(
                 speed = min(max(target, speed - a * T), speed + a * T)
                 profile = before + T * speed
             last_row, has_jumped = row, jumps
-            previous, reference = profile if is_first else before, profile
+            reference = profile
         velocity = 0.0
         if law.reference_difference:
-            velocity = (reference - previous) / T
+            velocity = 0.0 if last_goal is None else (reference - last_goal[0]) / T
         elif "reference_velocity" in signals:
-            rv = command(t - law.latency, signals["reference_velocity"], dt, width)
+            rv = command(t - late, signals["reference_velocity"], dt, width)
             before = rv if reference_velocity is None else reference_velocity
             velocity = reference_velocity = before + share * (rv - before)
+        added = 0.0
+        if "feedforward" in signals:
+            added = command(t - late, signals["feedforward"], dt, width)
+        latest = reference, velocity, added
+        goals = [(1.0 - rest, *latest), (rest, *(last_goal or latest))]
+        last_goal = latest
 
         if t > 0.0:
             times.append(t)
@@ -165,15 +174,17 @@ def controls_of(
         sample = min(int(t / dt + 1e-9), len(rows) - 1)
         gain = signals["gain"][sample] if "gain" in signals else 1.0
         limit = law.integral_limit
-        integral = min(max(integral + gain * law.ki * T * (reference - q), -limit), limit)
+        error = sum(part * goal for part, goal, *_ in goals) - q
+        integral = min(max(integral + gain * law.ki * T * error, -limit), limit)
 
-        u = gain * (law.kp * (reference - q) + law.kd * (velocity - v)) + integral
-        if "feedforward" in signals:
-            u += command(t - law.latency, signals["feedforward"], dt, width)
-        u = min(max(u, law.low), law.high)
-        if held is not None:
-            change = law.slew * T
-            u = min(max(u, held - change), held + change)
+        u = 0.0
+        for part, goal, velocity, added in goals:
+            own = gain * (law.kp * (goal - q) + law.kd * (velocity - v)) + added + integral
+            own = min(max(own, law.low), law.high)
+            if held is not None:
+                change = law.slew * T
+                own = min(max(own, held - change), held + change)
+            u += part * own
         if "enable" in signals and signals["enable"][sample] < 0.5:
             u, integral = 0.0, 0.0
         held = u
