@@ -474,7 +474,9 @@ def bounded_least_squares(A: Array, b: Array, lower: Array, upper: Array) -> Arr
     Returns:
         (c,) minimiser.
     """
-    norms = np.maximum(np.linalg.norm(A, axis=0), SMALLEST_NORM)
+    # An unknown without effect does not move. A tiny scale would turn round-off into a huge step.
+    norms = np.linalg.norm(A, axis=0)
+    norms = np.where(norms > SMALLEST_NORM, norms, 1.0)
 
     # The unbounded minimum is the solution where it lies inside the bounds.
     d = np.asarray(np.linalg.lstsq(A / norms, b)[0] / norms)

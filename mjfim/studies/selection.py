@@ -69,8 +69,10 @@ WORSE_ERROR_RATIO = 1.02
 
 # Engine steps of one linearisation, above which terms are chosen on segments spread over the
 # recordings, and the least number of these segments. A selection makes a hundred linearisations.
+# The selected model is fitted to more of them at last.
 MAX_STEPS = 100_000
 MIN_SEGMENTS = 20
+MORE_SEGMENTS = 5.0
 
 # Largest number of final fits, each of which may show further terms.
 MAX_FINAL_FITS = 3
@@ -156,7 +158,6 @@ class _Selector:
     max_terms: int
     steps: list[SelectionStep] = field(default_factory=list)
     ending: str = ""
-    remark: str = ""
     first: FittedModel = field(init=False)
 
     def selected(self, task: FitTask) -> Estimate:
@@ -168,7 +169,7 @@ class _Selector:
         Args:
             task: The fit of the stated model.
         """
-        task = self._affordable(task)
+        stated, task = task, self._affordable(task)
         is_free = task.settings.segments is None
         result = fit_task(
             self._search(with_length(task, "whole") if is_free else task), self.workers
@@ -189,6 +190,8 @@ class _Selector:
             is_whole &= final.task.settings.segment_length is None
             if model.result is final:
                 break
+        if task is not stated and not self._is_stopped():
+            model = self._on_more_data(model)
         return self._selected(model, is_free)
 
     def _affordable(self, task: FitTask) -> FitTask:
@@ -206,13 +209,19 @@ class _Selector:
             return task
         seconds = samples * dt
         task = with_length(task, length or seconds / MIN_SEGMENTS, seconds)
-        task = replace(task, predicts_whole=length is None)
-        problem = task.problem()
-        self.remark = (
-            f"only {len(problem.segments)} segments, {problem.sample_count * dt:.3g} of "
-            f"{whole * dt:.3g} s, were fitted; fit the selected model to all data"
-        )
-        return task
+        return replace(task, predicts_whole=length is None)
+
+    def _on_more_data(self, model: FittedModel) -> FittedModel:
+        """The model fitted to more segments of long recordings; the same where that diverges."""
+        begin_stage("fitting the selected model to more data")
+        result, task = model.result, self._predicting(model.result)
+        more = MORE_SEGMENTS * (task.settings.seconds or 0.0)
+        task = with_length(task, task.settings.segments, more)
+        try:
+            result = refit_task(self._search(task), result, self.workers, is_only_compared=False)
+        except SimulationDivergedError:
+            return model
+        return replace(model, result=result, tests=None)
 
     def _selected(self, model: FittedModel, is_free: bool) -> Estimate:
         """Estimate of the chosen model."""
@@ -225,8 +234,6 @@ class _Selector:
         selection = self._selection(model)
         tests = None if result.quality.unexplained or self._is_stopped() else model.tests
         estimate = estimate_from(result, self.budget, selection.refuted, tests)
-        if self.remark:
-            estimate = replace(estimate, warnings=(self.remark, *estimate.warnings))
         if selection.is_changed:
             settings = result.task.settings
             selection = replace(
@@ -268,12 +275,7 @@ class _Selector:
         is_settled = not is_changed and not (is_free and is_doubtful(result))
         if is_settled or self._is_stopped():
             return result
-        final = replace(
-            result.task,
-            start=result.theta,
-            held_out=self.held_out,
-            predicts_whole=self.first.result.task.predicts_whole,
-        )
+        final = self._predicting(result)
         if is_free:
             final = with_length(final, None)
 
@@ -284,6 +286,13 @@ class _Selector:
         if settings.segment_length is None or not begins_at_guess or is_free:
             return fit_task(self._search(final), self.workers, checks_log=False)
         return refit_task(self._search(final), result, self.workers, is_only_compared=False)
+
+    def _predicting(self, result: FitResult) -> FitTask:
+        """The task of a fit that begins at another one and predicts the held-out recordings."""
+        whole = self.first.result.task.predicts_whole
+        return replace(
+            result.task, start=result.theta, held_out=self.held_out, predicts_whole=whole
+        )
 
     def _at_final_fit(self, model: FittedModel, result: FitResult, is_free: bool) -> FittedModel:
         """The model at its final fit, with the terms that only this fit shows.
@@ -335,7 +344,7 @@ class _Selector:
     def _chosen(self, model: FittedModel) -> FittedModel:
         """Add terms, remove needless ones, and simplify the parameters."""
         model = self._pruned(self._grown(model))
-        if self.remark:
+        if self.first.result.task.settings.seconds is not None:
             # What segments of long logs hardly determine may be clear in all of them.
             return model
         simpler = self._simplified(model)
@@ -507,7 +516,8 @@ class _Selector:
         """The model with one term more, and the step that tried it, before it is decided on.
 
         None where the fit is no better, so that left-out data need not be predicted, where the
-        model cannot be simulated, and after a request to stop.
+        model cannot be simulated, and after a request to stop. A fit is better by Akaike's
+        criterion, which leaving out data approximates (Stone, 1977).
         """
         term = with_names(candidate, model.result.task.system.parameters.names)
         fit = self._fitted(replace(model, terms=(*model.terms, term)), term)
@@ -523,7 +533,7 @@ class _Selector:
             share=candidate.share,
             joints=candidate.joints,
         )
-        if _are_comparable(model, fit) and 0.0 <= fit.cost - model.cost <= EQUAL_COST:
+        if _are_comparable(model, fit) and fit.penalised_cost >= model.penalised_cost:
             self.steps.append(step)
             return None
         extended = self._assessed(fit)
@@ -606,6 +616,6 @@ class _Selector:
 def _are_comparable(model: FittedModel, fit: FittedModel) -> bool:
     """Whether the cost of a fit with more terms can be compared with that of a model."""
     found = fit.result
-    is_ended = found.solution.success and not found.solution.slow
+    is_ended = (found.solution.success or found.solution.stuck) and not found.solution.slow
     same_states = have_same_initial_states(found.problem, model.result.problem)
     return same_states and found.task.noise_is_stated and is_ended

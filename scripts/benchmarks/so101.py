@@ -228,7 +228,7 @@ def main() -> int:
     held_out = [recording(name, slice(None)) for name in motions]
     if args.select:
         found = mjfim.select_terms(experiment, fitted, held_out=held_out)
-        console.print(f"{found.selection} {found.warnings[0]}")
+        console.print(str(found.selection), *found.warnings, sep="\n")
     else:
         found = mjfim.identify(experiment, fitted, held_out=held_out)
     console.print(dict(zip(found.parameters, found.theta.tolist(), strict=True)))

@@ -90,8 +90,22 @@ def test_a_fit_to_some_seconds_has_segments_of_all_recordings(tmp_path: Path) ->
     with pytest.raises(ExperimentError, match="seconds needs a length of the segments"):
         experiment.replace(fit={"segments": "whole"})
 
-    low, high = mjfim.identify(experiment, logs).interval.T
+    found = mjfim.identify(experiment, logs)
+    assert any(sentence.startswith("only 6 segments, 1.5 of 6 s") for sentence in found.warnings)
+    low, high = found.interval.T
     assert ((low < system.parameters.true) & (system.parameters.true < high)).all()
+
+
+def test_what_has_no_effect_does_not_move(tmp_path: Path) -> None:
+    """Three of six recordings have no segment that is fitted."""
+    fit = {"bootstrap": 0, "segments": 0.25, "seconds": 0.75}
+    stated = experiment_of(tmp_path, "tilt", fit=fit)
+    experiment = stated.replace(nuisance={"bias": {"angle": True}, "per_recording": True})
+    system = System.resolve(experiment)
+    logs = [recorded(system, motor_torque(2.0, RATE, seed), seed) for seed in range(6)]
+    biases = mjfim.identify(experiment, logs).per_recording["bias angle"]
+    assert len(biases) == 6
+    assert np.abs(biases).max() < 0.1
 
 
 def test_what_was_not_tested_is_said() -> None:
@@ -126,5 +140,6 @@ def test_an_estimate_and_a_selection_say_on_how_much_terms_were_tested(
 
     # Of much data, segments are fitted that are spread over them.
     monkeypatch.setattr(selection, "MAX_STEPS", 2_000)
+    monkeypatch.setattr(selection, "MORE_SEGMENTS", 1.5)
     found = mjfim.select_terms(experiment, logs)
-    assert found.warnings[0].startswith("only 20 segments, 2.33 of 4 s")
+    assert any(sentence.startswith("only 25 segments, 2.94 of 4 s") for sentence in found.warnings)

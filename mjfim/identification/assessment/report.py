@@ -406,7 +406,15 @@ def _remarks_on_rate(result: FitResult) -> Iterator[str]:
 def _limits_of_search(
     result: FitResult, at_bound: Sequence[str], reasons: Sequence[str], *, interrupted: bool
 ) -> Iterator[str]:
-    """Warnings about the start, the end, and what the recordings do not determine."""
+    """Warnings about the data, the start, the end, and what the recordings do not determine."""
+    problem = result.problem
+    fitted, whole = problem.sample_count, sum(len(each.t) - 1 for each in problem.recordings)
+    if result.task.settings.seconds is not None and fitted < whole:
+        dt = problem.system.dt
+        yield (
+            f"only {len(problem.segments)} segments, {fitted * dt:.3g} of {whole * dt:.3g} s, were "
+            "fitted (fit.seconds); at last, fit the model to all data"
+        )
     yield from (sentence for sentence, _ in result.task.elsewhere)
     if result.begun_instead:
         yield (
