@@ -96,7 +96,8 @@ def init(
     if log is not None:
         table = read_columns(recording_paths([log], RecordingSpec())[0], RecordingSpec())
         steps = np.diff(log_time(table)[1])
-        row = float(np.median(steps)) if len(steps) else None
+        rising = steps[steps > 0.0]
+        row = float(np.median(rising)) if len(rising) else None
     wishes = Wishes(groups=groups_of(parameters), payload=payload, packages=packages, row=row)
     claim_file(file, [model], force=force)
     if is_urdf(model):

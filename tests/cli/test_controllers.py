@@ -62,6 +62,7 @@ TRUE = {
     "elbow_damping": 0.4,
     "shoulder_drag": 0.2,
     "elbow_drag": 0.1,
+    "duty": 9.0,
     "armature": 0.03,
     "bias qpos:shoulder": 0.01,
     "bias qpos:elbow": -0.02,
@@ -73,7 +74,8 @@ TRUE = {
 def test_the_laws_of_servos_are_proposed_and_found(here: Path) -> None:
     """A plain loop with motors makes the log; the MJCF has servos with other numbers."""
     text = ARM.read_text("utf-8").replace('timestep="0.001"', 'timestep="0.004"')
-    text = text.replace('<motor ctrlrange="-20 20"/>', '<position kp="60" kv="2"/>')
+    servo = '<position kp="60" kv="2" forcerange="-9 9"/>'
+    text = text.replace('<motor ctrlrange="-20 20"/>', servo)
     (here / "arm.xml").write_text(text.replace("<motor", "<position"), "utf-8")
     model, joints = mujoco.MjModel.from_xml_string(text), ("shoulder", "elbow")
     model.dof_armature[:] = TRUE["armature"]
@@ -84,7 +86,7 @@ def test_the_laws_of_servos_are_proposed_and_found(here: Path) -> None:
     t = 0.02 * np.arange(200)[:, None]
     steps = rng.uniform(-0.5, 0.5, (10, 2)).repeat(20, axis=0)
     goals = steps + 0.3 * np.sin(2.0 * np.pi * t * [0.9, 1.3])
-    law = PlainLaw("", 1, TRUE["kp"], TRUE["kd"], reference_difference=True)
+    law = PlainLaw("", 1, TRUE["kp"], TRUE["kd"], low=-9.0, high=9.0, reference_difference=True)
     laws = {
         i: replace(law, joint=joint, latency=TRUE[f"{joint}_latency"])
         for i, joint in enumerate(joints)
@@ -95,8 +97,10 @@ def test_the_laws_of_servos_are_proposed_and_found(here: Path) -> None:
     header = "t,goal_shoulder,goal_elbow,pos_shoulder,pos_elbow"
     rows = np.hstack([t, goals, angles])
     np.savetxt("log.csv", rows, delimiter=",", header=header, comments="")
+    rows[-1, 0] = np.nan
+    np.savetxt("cut_off.csv", rows, delimiter=",", header=header, comments="")
 
-    done("init arm.xml --log log.csv --parameters servos")
+    done("init arm.xml --log cut_off.csv --parameters servos")
     said = " ".join(done("validate arm.toml").output.split())
     assert "laws in place of 2 position servos" in said
     said = " ".join(done("identify arm.toml log.csv -o out").output.split())
@@ -106,6 +110,7 @@ def test_the_laws_of_servos_are_proposed_and_found(here: Path) -> None:
     require_found(found, np.array([*TRUE.values()]))
     written = mujoco.MjModel.from_xml_path("out/identified.xml")
     assert written.actuator("elbow").biasprm[1] == pytest.approx(-found["kp"].value)
+    assert written.actuator("elbow").forcerange[1] == pytest.approx(found["duty"].value)
 
 
 @pytest.mark.usefixtures("folder")

@@ -69,7 +69,7 @@ ARRAYS: dict[str, dict[str, str]] = {
     "site": {"quat": "site_quat", **MODEL_ARRAYS["site"]},
     "joint": {"pos": "jnt_pos", "axis": "jnt_axis", **MODEL_ARRAYS["joint"]},
     "tendon": MODEL_ARRAYS["tendon"],
-    "actuator": MODEL_ARRAYS["actuator"],
+    "actuator": {"forcerange": "actuator_forcerange", **MODEL_ARRAYS["actuator"]},
 }
 INERTIAL = {
     "pos": "body_ipos",
@@ -380,7 +380,7 @@ def _expressible(system: System, theta: Array) -> tuple[System, Any]:
     """A system without what is no part of an MJCF, and its model at parameters.
 
     It has no floor that only the experiment states, and no laws. Servos have the gains of the laws
-    that took their place.
+    that took their place, and their largest forces where the MJCF limits them.
     """
     if system.experiment.limits.floor is not None:
         stated = system.experiment.replace(limits={"floor": None})
@@ -400,6 +400,9 @@ def _expressible(system: System, theta: Array) -> tuple[System, Any]:
             kp, kd = (gain * law.numbers.get(name, 0.0) for name in ("kp", "kd"))
             servo = wanted.actuator(law.actuator)
             servo.gainprm[0], servo.biasprm[1:3] = kp, (-kp, -kd)
+            if wanted.actuator_forcelimited[servo.id] and "saturation[1]" in law.numbers:
+                low, high = (law.numbers[f"saturation[{i}]"] for i in (0, 1))
+                servo.forcerange[:] = gain * low, gain * high
     return bare, wanted
 
 
@@ -462,7 +465,8 @@ def write_identified(
         remarks.append(
             f"{path.name}: it holds the model without the control laws of {names}, because MJCF "
             "has no laws with a rate; estimate.json holds their numbers. A servo whose place a law "
-            "took has its kp and kd, but neither its latency nor its largest force"
+            "took has its kp and kd, and its largest force where the MJCF has a forcerange, but "
+            "not its latency"
         )
     return remarks
 
