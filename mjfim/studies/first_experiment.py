@@ -8,7 +8,6 @@ from bisect import bisect_left
 from collections.abc import Mapping, Sequence
 from dataclasses import field, replace
 from functools import cache
-from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -554,11 +553,17 @@ class _Refinement:
             # A smaller motion has more room.
             trial = bisect_left(range(TRIALS), least, key=room)
             shares = np.full(len(amplitudes), SHRINKING**trial)
-            for factor, actuator in product(GROWTHS, range(len(shares))):
-                larger = shares.copy()
-                larger[actuator] = min(factor * shares[actuator], 1.0)
-                if larger[actuator] > shares[actuator] and self._room(task, larger) >= least:
-                    shares = larger
+            growing = [*range(len(shares))]
+            for factor in GROWTHS:
+                # What could not grow by the same factor before is tried with a smaller one only.
+                tried = range(len(shares)) if factor < GROWTHS[0] else growing
+                growing = []
+                for actuator in tried:
+                    larger = shares.copy()
+                    larger[actuator] = min(factor * shares[actuator], 1.0)
+                    if larger[actuator] > shares[actuator] and self._room(task, larger) >= least:
+                        shares = larger
+                        growing.append(actuator)
             return two_digits(amplitudes * shares)
         return None
 
