@@ -13,6 +13,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy import stats
 from scipy.signal import lfilter
+from scipy.special import polygamma
 
 from mjfim.identification.assessment.robust_covariance import (
     Uncertainty,
@@ -230,6 +231,31 @@ def test_residuals_that_are_alike_in_slow_parts_count_as_few_groups() -> None:
     half = float(stats.t.ppf(0.975, 3)) * std
     assert half > 1.5 * (narrow.interval[0, 1] - theta[0])
     assert_allclose(wide.interval[0], theta + np.array([-half, half]), rtol=1e-9)
+
+
+@pytest.mark.parametrize("others", [2.0, 0.0])
+def test_groups_of_data_tell_about_all_unknowns_together(others: float) -> None:
+    """Unknowns of a wrong model that differ in four stages of the data, all of them or only one.
+
+    Where they err alike, widths scatter less than by three degrees of freedom. One that errs alone
+    stays far wider.
+    """
+    rng, size = np.random.default_rng(7), np.array([2.0, *[others] * 7])
+    X = rng.choice([-1.0, 1.0], (1, 80 * FINE, 8))
+    sides = []
+    for _ in range(60):
+        stages = np.repeat(size * rng.standard_normal((4, 8)), 20 * FINE, axis=0)
+        y = np.sum(X * stages, axis=2) + noise(0.0, X.shape[:2], rng)
+        theta, condensed = Linear(X).fitted(y)
+        sides.append(assess(condensed, theta, FINE, is_white=False).interval)
+    low, high = np.moveaxis(sides, 2, 0)
+    covered, widths = (low <= 0.0) & (high >= 0.0), np.log(high - low)
+    assert covered.mean() >= 0.95
+    assert covered[:, 0].mean() >= 0.85
+    if others:
+        assert widths.std(axis=0).mean() < 0.6 * np.sqrt(polygamma(1, 1.5)) / 2.0
+    else:
+        assert widths[:, 0].mean() - widths[:, 1:].mean() > np.log(4.0)
 
 
 def test_blocks_are_four_autocorrelation_times_long() -> None:
