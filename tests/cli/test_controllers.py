@@ -103,8 +103,7 @@ def test_the_laws_of_servos_are_proposed_and_found(here: Path) -> None:
     done("init arm.xml --log cut_off.csv --parameters servos")
     said = " ".join(done("validate arm.toml").output.split())
     assert "laws in place of 2 position servos" in said
-    said = " ".join(done("identify arm.toml log.csv -o out").output.split())
-    assert "The control of shoulder is that of its law in the loop, evaluated at 250 Hz" in said
+    done("identify arm.toml log.csv -o out")
     found = mjfim.Estimate.load("out")
     assert found.parameters == tuple(TRUE)
     require_found(found, np.array([*TRUE.values()]))

@@ -114,6 +114,10 @@ def controls_of(
     rest = (law.latency / T) % 1.0 if by_ticks else 0.0
     late = law.latency - rest * T
 
+    def received(name: str) -> float:
+        """Mean of a signal at this tick."""
+        return command(t - late, signals[name], dt, width)
+
     # What is known before the first tick: the joint has always moved at its first velocity.
     q, v = start
     times, positions, velocities = [-1.0, 0.0], [q - v, q], [v, v]
@@ -124,7 +128,7 @@ def controls_of(
 
     while True:
         t, q, v = yield u
-        r = command(t - late, rows, dt, width)
+        r = received("reference")
         previous = r if filtered is None else filtered
         filtered = reference = previous + share * (r - previous)
         if math.isfinite(law.acceleration):
@@ -148,12 +152,10 @@ def controls_of(
         if law.reference_difference:
             velocity = 0.0 if last_goal is None else (reference - last_goal[0]) / T
         elif "reference_velocity" in signals:
-            rv = command(t - late, signals["reference_velocity"], dt, width)
+            rv = received("reference_velocity")
             before = rv if reference_velocity is None else reference_velocity
             velocity = reference_velocity = before + share * (rv - before)
-        added = 0.0
-        if "feedforward" in signals:
-            added = command(t - late, signals["feedforward"], dt, width)
+        added = received("feedforward") if "feedforward" in signals else 0.0
         latest = reference, velocity, added
         goals = [(1.0 - rest, *latest), (rest, *(last_goal or latest))]
         last_goal = latest
