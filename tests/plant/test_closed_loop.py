@@ -154,7 +154,6 @@ def test_a_step_has_its_effect_at_any_latency(jump: dict[str, float]) -> None:
 
     # A jump acts at once: a profile needs 0.16 s.
     assert (q.min() > 0.015) == bool(jump)
-    assert np.abs(np.diff(q)).max() < 0.15 * np.ptp(q)
     assert np.diff(q).max() < 0.5 * np.diff(q).min()
 
 
