@@ -220,24 +220,6 @@ def standard_deviations(information: Array) -> Array:
     return np.asarray(np.sqrt(np.nan_to_num(variances, nan=np.inf)) / scale)
 
 
-# Variance of the logarithm of a standard deviation with three degrees of freedom: honest ones come
-# from the scatter between four groups of data.
-VARIANCE_OF_LOG = 0.234
-
-
-def without_chance(std: Array) -> Array:
-    """Standard deviations without that part of their differences that chance explains.
-
-    Their logarithms are shrunk to the mean (James & Stein, Estimation with quadratic loss, 1961).
-
-    Args:
-        std: (k,) positive standard deviations, each with three degrees of freedom.
-    """
-    logs = np.log(std)
-    kept = 1.0 - VARIANCE_OF_LOG / max(float(logs.var()), VARIANCE_OF_LOG)
-    return np.asarray(np.exp(logs.mean() + kept * (logs - logs.mean())))
-
-
 def inverse_root(information: Array) -> Array:
     """Matrices W with `W W'` the inverse of an information.
 

@@ -2,13 +2,13 @@
 
 Commands do not depend on the state, so that they are computed for all ticks before a simulation:
 
-    r(t)   = mean of the logged reference over [t - d, t - d + w]
+    r(t)   = mean of the logged reference over [t - d', t - d' + w]
     r_f,k  = r_f,k-1 + a (r(t_k) - r_f,k-1),     a = 1 - exp(-T / tau)
 
-with the latency d, the period T of the law, and the time constant tau. The width w is that of a
-tick, at most a sample. References that are points of a continuous signal are interpolated linearly,
-which is w = one sample. A motion profile with the acceleration a goes to r_f in the shortest time,
-and takes its place:
+with the period T of the law and the time constant tau. The latency d' is the stated d, or its whole
+ticks as below. The width w is that of a tick, at most a sample. References that are points of a
+continuous signal are interpolated linearly, which is w = one sample. A motion profile with the
+acceleration a goes to r_f in the shortest time, and takes its place:
 
     w_k = min(sqrt((a T / 2)^2 + 2 a |e_k|) - a T / 2, |e_k| / T),     e_k = r_f,k - p_k-1
     s_k = s_k-1 + (w_k sgn(e_k) - s_k-1 inside +-a T),     p_k = p_k-1 + T s_k
@@ -19,11 +19,15 @@ At a tick k, with the measured position q and velocity v, and the commands of th
     u_k = g (kp (r_k - q) + kd (rdot_k - v)) + I_k + f_k
 
 is clipped to the range of the control, then to the largest change since the last tick. The factor g
-and the feed-forward f come from the log. A held command that arrives inside a tick acts in the rest
-of it: commands are late by whole ticks, and the control is the mean of u_k with the commands of
-this tick and with those of the tick before, weighted by their parts of the tick. The mean of the
-commands instead would let a small part of a step cause the largest control, so that the motion
-would not depend on d between two ticks. The measurement is that of the model, late by the latency
+and the feed-forward f come from the log.
+
+Behind a motion profile, and where commands are held and a tick is at most a sample, a command that
+arrives inside a tick acts in the rest of it. So d' is the whole ticks of d. The control is the mean
+of u_k with the commands of this tick and with those of the tick before, weighted by their parts of
+the tick, and so is r_k in the integral. The mean of the commands alone would let a small part of a
+step cause the largest control, so that the motion would not depend on d between ticks.
+
+The measurement is that of the model, late by the latency
 of the feedback: positions between two ticks follow the cubic polynomial through their positions and
 velocities, velocities a straight line, so that they depend continuously on the latency.
 """
@@ -45,6 +49,9 @@ FORGOTTEN_AFTER = 37.0
 
 # Numbers that commands depend on.
 DECIDING_NUMBERS = ("latency", "time_constant", "acceleration", "jump")
+
+# Rounding of the share of a sample in a mean.
+ROUNDING = 1e-9
 
 # Value of a column `enable` from which on a law is on.
 ON = 0.5
@@ -160,7 +167,7 @@ class LawCommands:
     Attributes:
         before: Number of evaluations before the first one of the curves.
         rest: (m, c) parts of a tick by which commands are later than whole ticks.
-        reference: (K, m, c) references, filtered and after the motion profile, late by whole ticks
+        reference: (K, m, c) references, filtered and after the motion profile, without `rest`
             [m or rad].
         profile_velocity: (K, m, c) velocities of the motion profiles [m/s or rad/s].
         reference_velocity: (K, m, c) velocities of the references [m/s or rad/s], or None.
@@ -302,7 +309,7 @@ class _Columns:
     def changes(self, quantity: Quantity, places: Array) -> Array:
         """(K, m, c) changes of a quantity since the tick before, in the latest sample of a mean."""
         sample, share = self._samples(places)
-        latest = np.where(share > 0.0, self._following(sample), sample)
+        latest = np.where(share > ROUNDING, self._following(sample), sample)
         values = self._values(quantity, latest, 0.0)
         return np.asarray(np.abs(np.diff(values, axis=0, prepend=values[:1])))
 
@@ -700,10 +707,11 @@ class RunningLaws:
             limit = numbers.integral_limit
             self._integral = _clipped(self._integral + step, -limit, limit)
             kept = kept + self._integral
-        control = self._limited(self._drive[tick] + kept)
+        control, self.is_clipped = self._limited(self._drive[tick] + kept)
         if self._has_rest:
-            earlier = self._limited(self._earlier[tick] + kept)
+            earlier, is_clipped = self._limited(self._earlier[tick] + kept)
             control = control + commands.rest * (earlier - control)
+            self.is_clipped = np.where(commands.rest > 0.5, is_clipped, self.is_clipped)
 
         # A driver that is off forgets its integral.
         if commands.enabled is not None:
@@ -715,16 +723,15 @@ class RunningLaws:
         self._has_held = True
         return control
 
-    def _limited(self, control: Array) -> Array:
-        """The control: (m, c) inside its range, and near that of the tick before."""
+    def _limited(self, control: Array) -> tuple[Array, np.ndarray]:
+        """The control: (m, c) inside its range, near that of the tick before; where it changed."""
         if not self._has_limits:
-            return control
+            return control, self.is_clipped
         limited = _clipped(control, self._numbers.saturation_low, self._numbers.saturation_high)
         if self._is_slow and self._has_held:
             change = self._largest_change
             limited = _clipped(limited, self.held - change, self.held + change)
-        self.is_clipped = limited != control
-        return limited
+        return limited, limited != control
 
     def _measure(self, q: Array, v: Array) -> tuple[Array, Array]:
         """Positions and velocities that the driver uses, from those of the joints now."""

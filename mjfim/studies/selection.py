@@ -191,7 +191,7 @@ class _Selector:
             if model.result is final:
                 break
         if task is not stated and not self._is_stopped():
-            model = self._on_more_data(model)
+            model = self._on_more_data(model, stated.settings.seconds or np.inf)
         return self._selected(model, is_free)
 
     def _affordable(self, task: FitTask) -> FitTask:
@@ -211,17 +211,20 @@ class _Selector:
         task = with_length(task, length or seconds / MIN_SEGMENTS, seconds)
         return replace(task, predicts_whole=length is None)
 
-    def _on_more_data(self, model: FittedModel) -> FittedModel:
-        """The model fitted to more segments of long recordings; the same where that diverges."""
+    def _on_more_data(self, model: FittedModel, most: float) -> FittedModel:
+        """The model fitted to more segments of long recordings, `most` seconds at most.
+
+        It stays the same where that diverges, and after a request to stop.
+        """
         begin_stage("fitting the selected model to more data")
         result, task = model.result, self._predicting(model.result)
-        more = MORE_SEGMENTS * (task.settings.seconds or 0.0)
+        more = min(MORE_SEGMENTS * (task.settings.seconds or 0.0), most)
         task = with_length(task, task.settings.segments, more)
         try:
             result = refit_task(self._search(task), result, self.workers, is_only_compared=False)
         except SimulationDivergedError:
             return model
-        return replace(model, result=result, tests=None)
+        return model if self._is_stopped() else replace(model, result=result, tests=None)
 
     def _selected(self, model: FittedModel, is_free: bool) -> Estimate:
         """Estimate of the chosen model."""
@@ -533,7 +536,8 @@ class _Selector:
             share=candidate.share,
             joints=candidate.joints,
         )
-        if _are_comparable(model, fit) and fit.penalised_cost >= model.penalised_cost:
+        is_no_better = fit.penalised_cost >= model.penalised_cost
+        if _are_comparable(model, fit) and is_no_better and fit.cost <= model.cost + EQUAL_COST:
             self.steps.append(step)
             return None
         extended = self._assessed(fit)

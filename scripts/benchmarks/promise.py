@@ -221,9 +221,7 @@ def row_of(robot: str, experiment: mjfim.Experiment, logs: Sequence[mjfim.Record
         moved |= {sentence for sentence in found.warnings if "disagree" in sentence}
         for each, check in zip(ratios, checks, strict=True):
             promise = [np.nan if row.nuisance else row.std for row in check.rows]
-            # A bound may cut intervals off, but not this covariance.
-            honest = np.sqrt(np.diag(found.honest_covariance))
-            quotients = np.where(np.isfinite(found.honest_std), honest, np.nan) / promise
+            quotients = found.honest_std / promise
             each += quotients[np.isfinite(quotients)].tolist()
     for sentence in sorted(moved):
         print(f"{robot}: {sentence}", flush=True)

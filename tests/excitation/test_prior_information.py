@@ -79,15 +79,10 @@ def test_what_a_file_knows_is_found_by_name(case: str, tmp_path: Path) -> None:
 
 
 def estimate_file(path: Path, names: list[str], honest: list[float | None], **more: object) -> Path:
-    """An estimate.json with formal deviations of 0.1 and honest ones, which may be unknown.
-
-    It is that of two recordings, unless it states others.
-    """
+    """An estimate.json with formal deviations of 0.1 and honest ones, which may be unknown."""
     zero = np.zeros((len(names), len(names))).tolist()
-    values = {"parameters": names, "data": zero, "prior": zero, "sigma": {}}
-    covariance = np.diag([np.inf if each is None else each**2 for each in honest])
-    values |= {"std": [0.1] * len(names), "honest_covariance": covariance.tolist()}
-    values |= {"recordings": ["one", "two"], **more}
+    values = {"parameters": names, "data": zero, "prior": zero, "sigma": {}, **more}
+    values |= {"std": [0.1] * len(names), "honest_std": honest}
     path.write_text(json.dumps(values), encoding="utf-8")
     return path
 
@@ -116,7 +111,7 @@ def test_estimates_tell_how_much_wider_honest_deviations_are(tmp_path: Path) -> 
 def test_sigma_is_that_of_the_residuals_of_an_earlier_estimate(tmp_path: Path) -> None:
     """Data count by the honest deviation and the noise of the estimate; stated priors do not."""
     names, honest = ["m", "l", "c"], np.array([0.2, 5.0, 0.1])
-    ratio = expected_inflation([(10.0 * honest, 2)])
+    ratio = expected_inflation([10.0 * honest])
     parameters = {**CART_PARAMETERS, "l": {**CART_PARAMETERS["l"], "prior": 0.02}}
     white = cart_task(tmp_path, parameters=parameters)
     sigma = dict(zip(white.system.outputs.names, 3.0 * white.system.noise.sigma, strict=True))
@@ -131,18 +126,15 @@ def test_sigma_is_that_of_the_residuals_of_an_earlier_estimate(tmp_path: Path) -
     assert f"(c) to {ratio[1]:.0f} (l) times" in sigma_remark(found.inflation, names)
 
 
-@pytest.mark.parametrize("recordings", [["one"], ["one", "two"]])
-def test_what_a_model_lacks_averages_out_between_recordings(
-    recordings: list[str], tmp_path: Path
-) -> None:
-    """A repetition halves the variance, but one recording shows half of what a model lacks."""
+def test_what_a_model_lacks_does_not_average_out(tmp_path: Path) -> None:
+    """A repetition of an earlier experiment halves the variance of white noise, and no other."""
     data = check_task(cart_task(tmp_path)).information
-    honest = np.array([0.3, 0.2, 0.25])
-    more = {"data": data.tolist(), "recordings": recordings}
-    path = estimate_file(tmp_path / "e.json", ["m", "l", "c"], honest.tolist(), **more)
+    honest = np.array([0.2, 5.0, 0.1])
+    ratio = expected_inflation([10.0 * honest])
+    path = estimate_file(tmp_path / "e.json", ["m", "l", "c"], honest.tolist(), data=data.tolist())
     found = check_task(cart_task(tmp_path, earlier=[str(path)]))
-    squares = 1.0 + (3 - len(recordings)) * ((10.0 * honest) ** 2 - 1.0)
-    wanted = np.sqrt(np.diag(np.linalg.inv(data)) / 2.0) * squares.prod() ** (1.0 / 6.0)
+    white = np.diag(np.linalg.inv(data))
+    wanted = np.sqrt(white / 2.0 + (ratio**2 - 1.0) * white)
     assert_allclose([row.std for row in found.rows], wanted, rtol=1e-6)
 
 

@@ -74,6 +74,10 @@ LAWS: dict[str, dict[str, Any]] = {
 }
 
 
+# Five ticks in a sample of 200 Hz.
+FAST = {"rate": 1000.0}
+
+
 def plain(law: dict[str, Any], joint: str) -> PlainLaw:
     """The law of a table for the plain loop."""
     values = dict(law)
@@ -122,13 +126,14 @@ def oracle(system: System, law: dict[str, Any], inputs: np.ndarray) -> np.ndarra
     return states
 
 
-@pytest.mark.parametrize("name", LAWS)
-def test_a_law_equals_a_plain_loop(name: str) -> None:
-    system, model, inputs = prepared({"shoulder": LAWS[name]})
+@pytest.mark.parametrize(("name", "more"), [*((name, {}) for name in LAWS), ("profiled", FAST)])
+def test_a_law_equals_a_plain_loop(name: str, more: dict[str, float]) -> None:
+    law = LAWS[name] | more
+    system, model, inputs = prepared({"shoulder": law}, **({"rate": 200.0} if more else {}))
     found = system.plant.simulator.rollout([model], START[None], inputs[None])
 
     assert found.finite.all()
-    expected = oracle(system, LAWS[name], inputs)
+    expected = oracle(system, law, inputs)
     assert_allclose(found.states[0], expected, atol=1e-11)
 
     # The law has an effect, so that a wrong law would be seen.

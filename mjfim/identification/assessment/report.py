@@ -413,7 +413,7 @@ def _limits_of_search(
         dt = problem.system.dt
         yield (
             f"only {len(problem.segments)} segments, {fitted * dt:.3g} of {whole * dt:.3g} s, were "
-            "fitted (fit.seconds); at last, fit the model to all data"
+            "fitted. Fit the final model to all data"
         )
     yield from (sentence for sentence, _ in result.task.elsewhere)
     if result.begun_instead:

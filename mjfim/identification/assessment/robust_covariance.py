@@ -16,7 +16,6 @@ import numpy as np
 import scipy
 
 from mjfim.arrays import NORMAL_95, Array, record, scaled_pseudo_inverse, scaled_to_unit_diagonal
-from mjfim.information.criteria import without_chance
 from mjfim.optimize.condensed_least_squares import Condensed
 
 # Length of an independent block over the autocorrelation time of the residuals.
@@ -316,10 +315,7 @@ def robust_uncertainty(
     for order in () if is_white or number < 2 else _orders(information):
         groups = np.array_split(order, number)
         of_groups = _sandwich(np.array([scores[g].sum(axis=0) for g in groups]), prior, root)
-        # Few groups tell little about each unknown, and more about all of them.
-        ratio = np.maximum(np.diag(of_groups) / formal**2, SMALLEST_VARIANCE)
-        usual = without_chance(np.sqrt(ratio)) ** 2
-        wide = np.hypot(formal * np.sqrt(usual * (ratio.mean() / usual.mean())), between)
+        wide = np.hypot(np.sqrt(np.maximum(np.diag(of_groups), 0.0)), between)
         half_width = np.maximum(half_width, t_quantile(number - 1) * wide)
     low, high = theta - half_width, theta + half_width
     if len(replicates):

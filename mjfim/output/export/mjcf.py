@@ -400,9 +400,9 @@ def _expressible(system: System, theta: Array) -> tuple[System, Any]:
             kp, kd = (gain * law.numbers.get(name, 0.0) for name in ("kp", "kd"))
             servo = wanted.actuator(law.actuator)
             servo.gainprm[0], servo.biasprm[1:3] = kp, (-kp, -kd)
-            if wanted.actuator_forcelimited[servo.id] and "saturation[1]" in law.numbers:
-                low, high = (law.numbers[f"saturation[{i}]"] for i in (0, 1))
-                servo.forcerange[:] = gain * low, gain * high
+            ends = [gain * law.numbers.get(f"saturation[{i}]", np.inf) for i in (0, 1)]
+            if wanted.actuator_forcelimited[servo.id] and np.isfinite(ends).all():
+                servo.forcerange[:] = ends
     return bare, wanted
 
 
@@ -465,8 +465,8 @@ def write_identified(
         remarks.append(
             f"{path.name}: it holds the model without the control laws of {names}, because MJCF "
             "has no laws with a rate; estimate.json holds their numbers. A servo whose place a law "
-            "took has its kp and kd, and its largest force where the MJCF has a forcerange, but "
-            "not its latency"
+            "took has its kp and kd, and both ends of its saturation where the MJCF has a "
+            "forcerange, but not its latency"
         )
     return remarks
 
