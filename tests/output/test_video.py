@@ -12,6 +12,7 @@ import mujoco
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
+from PIL import Image
 
 import mjfim
 from mjfim.arrays import Array
@@ -218,8 +219,7 @@ class TestVideo:
     @pytest.mark.usefixtures("drawing")
     def test_too_slow_for_a_report(self, swing: mujoco.MjModel) -> None:
         film = identified(swing, swinging(3.0))
-        for kind in ("gif", "webp"):
-            assert drawn(film, kind).media_type == f"image/{kind}"
+        drawn(film, "gif")
         with pytest.raises(NoVideoError, match=r"drawing it takes about \d+ s here"):
             render(film, "gif", seconds=1e-3, fewest_frames=7.0)
 
@@ -243,6 +243,25 @@ class TestVideo:
         change = np.abs(first - later)[40:380].max(axis=(0, 2))
         half = video.width // 2
         assert change[: half - 20].max() < 40 < change[half + 20 :].max()
+
+    @pytest.mark.slow
+    @pytest.mark.usefixtures("drawing")
+    @pytest.mark.parametrize("kind", ["gif", "webp"])
+    def test_pictures_repeat_for_ever(self, kind: str, swing: mujoco.MjModel) -> None:
+        video = drawn(identified(swing, swinging(3.0), swinging(3.0, 0.6)), kind)
+        with Image.open(io.BytesIO(video.data)) as picture:
+            assert picture.format == kind.upper()
+            assert picture.size == (video.width, video.height)
+            assert picture.info["loop"] == 0
+            frames = getattr(picture, "n_frames", 1)
+            picture.seek(1)
+            picture.load()
+            assert frames * picture.info["duration"] == pytest.approx(3000.0, rel=0.1)
+
+
+def test_a_video_is_not_printed_as_bytes() -> None:
+    video = Video(data=b"frames", media_type="image/gif", caption="slow", width=2, height=2)
+    assert "frames" not in repr(video) and "caption='slow'" in repr(video)
 
 
 def test_a_motion_of_another_model_is_no_video(tmp_path: Path) -> None:
