@@ -27,9 +27,9 @@ of u_k with the commands of this tick and with those of the tick before, weighte
 the tick, and so is r_k in the integral. The mean of the commands alone would let a small part of a
 step cause the largest control, so that the motion would not depend on d between ticks.
 
-The measurement is that of the model, late by the latency
-of the feedback: positions between two ticks follow the cubic polynomial through their positions and
-velocities, velocities a straight line, so that they depend continuously on the latency.
+The measurement is that of the model, late by the latency of the feedback: positions between two
+ticks follow the cubic polynomial through their positions and velocities, velocities a straight
+line, so that they depend continuously on the latency.
 """
 
 from __future__ import annotations
@@ -630,11 +630,7 @@ class RunningLaws:
         gain = 1.0 if commands.gain is None else commands.gain
         feedforward = commands.feedforward
         added = np.zeros_like(drive) if feedforward is None else feedforward
-        self._drive = self._earlier = gain * drive + added
-        self._has_rest = bool(commands.rest.any())
-        if self._has_rest:
-            self._earlier = gain * _earlier(drive) + _earlier(added)
-        self._reference = _earlier(commands.reference, commands.rest)
+        self._drive = gain * drive + added
         self._next = ticks.before
 
         seconds = ticks.seconds
@@ -652,9 +648,15 @@ class RunningLaws:
         self._is_slow = bool(np.isfinite(numbers.slew).any())
         self._filters = bool((self._velocity_share < 1.0).any())
         self._is_late = bool(numbers.feedback_latency.any())
-        if self._has_rest and not self._has_limits:
-            self._drive = self._drive + commands.rest * (self._earlier - self._drive)
-            self._has_rest = False
+        if self._integrates:
+            self._reference = _earlier(commands.reference, commands.rest)
+        # Without limits, the mean of two controls is the control of the mean.
+        has_rest = bool(commands.rest.any())
+        self._mixes = has_rest and self._has_limits
+        if has_rest:
+            self._drive_before = gain * _earlier(drive) + _earlier(added)
+        if has_rest and not self._has_limits:
+            self._drive = self._drive + commands.rest * (self._drive_before - self._drive)
 
         self.held = memory.held
         self.is_clipped = np.zeros(memory.held.shape, dtype=bool)
@@ -708,9 +710,9 @@ class RunningLaws:
             self._integral = _clipped(self._integral + step, -limit, limit)
             kept = kept + self._integral
         control, self.is_clipped = self._limited(self._drive[tick] + kept)
-        if self._has_rest:
-            earlier, is_clipped = self._limited(self._earlier[tick] + kept)
-            control = control + commands.rest * (earlier - control)
+        if self._mixes:
+            before, is_clipped = self._limited(self._drive_before[tick] + kept)
+            control = control + commands.rest * (before - control)
             self.is_clipped = np.where(commands.rest > 0.5, is_clipped, self.is_clipped)
 
         # A driver that is off forgets its integral.
