@@ -12,7 +12,7 @@ from mjfim.arrays import Array, record
 from mjfim.errors import ExperimentError, RecordingError, listed
 from mjfim.experiment.parameters import INITIAL_STATE_PREFIX
 from mjfim.files import read_json
-from mjfim.information.criteria import marginal
+from mjfim.information.criteria import marginal, without_chance
 
 
 @record
@@ -47,9 +47,10 @@ def known_from(paths: Sequence[Path], names: Sequence[str]) -> EarlierExperiment
 
     The inflation is the honest standard deviation of an estimate over its formal one, which white
     noise would leave: residuals of the same model are expected to widen the next estimate as much.
-    Of several estimates it is the root mean square. As it comes from few groups of data, the part
-    of the differences between parameters that chance explains is left out. A parameter of which
-    none is known has the geometric mean of the others.
+    One recording shows no scatter between recordings, which then counts as much as that within it.
+    Of several estimates the inflation is the root mean square. As it comes from few groups of data,
+    the part of the differences between parameters that chance explains is left out. A parameter of
+    which none is known has the geometric mean of the others.
 
     Args:
         paths: Files design.json and estimate.json.
@@ -59,11 +60,11 @@ def known_from(paths: Sequence[Path], names: Sequence[str]) -> EarlierExperiment
         ExperimentError: A file cannot be used; the message names it.
     """
     total = np.zeros((len(names), len(names)))
-    ratios: list[Array] = []
+    estimates: list[tuple[Array, int]] = []
     sigma: dict[str, float] = {}
     for path in paths:
         try:
-            known, data, prior, ratio, noise = _information_in(path)
+            known, data, prior, ratio, count, noise = _information_in(path)
         except RecordingError as error:
             raise ExperimentError(f"earlier: {error}") from None
 
@@ -81,45 +82,47 @@ def known_from(paths: Sequence[Path], names: Sequence[str]) -> EarlierExperiment
         there = np.array([known.index(name) for name in common])
         total[np.ix_(here, here)] += marginal(data, prior, there)
         if ratio is not None:
-            ratios.append(np.full(len(names), np.nan))
-            ratios[-1][here] = ratio[there]
+            inflation = np.full(len(names), np.nan)
+            inflation[here] = ratio[there]
+            estimates.append((inflation, count))
         sigma |= noise
-    return EarlierExperiments(information=total, inflation=expected_inflation(ratios), sigma=sigma)
+    inflation = expected_inflation(estimates)
+    return EarlierExperiments(information=total, inflation=inflation, sigma=sigma)
 
 
-# Variance of the logarithm of a standard deviation with three degrees of freedom: honest ones come
-# from the scatter between four groups of data.
-VARIANCE_OF_LOG = 0.234
+# Degrees of freedom of honest standard deviations, which come from the scatter between four groups
+# of data.
+FREEDOM = 3
 
 
-def expected_inflation(ratios: Sequence[Array]) -> Array:
+def expected_inflation(estimates: Sequence[tuple[Array, int]]) -> Array:
     """(p,) inflations that are expected after those of estimates, as `known_from` returns them.
 
     Args:
-        ratios: (p,) inflation of each estimate; NaN where it is not known.
+        estimates: (p,) honest over formal standard deviations of each estimate, NaN where they are
+            not known, and the number of its recordings.
     """
-    known = np.array(ratios)
+    known = np.array([ratio for ratio, _ in estimates])
     known[~np.isfinite(known) | (known <= 0.0)] = np.nan
     if not np.isfinite(known).any():
         return np.zeros(0)
-    squares = np.maximum(known, 1.0) ** 2
+    # Scatter within a recording, and between recordings.
+    parts = np.array([[2.0 if count == 1 else 1.0] for _, count in estimates])
+    squares = 1.0 + parts * (np.maximum(known, 1.0) ** 2 - 1.0)
     is_known = np.isfinite(squares).any(axis=0)
-    logs = 0.5 * np.log(np.nanmean(squares[:, is_known], axis=0))
-    # What chance explains of their differences is shrunk (James & Stein).
-    usual, spread = float(logs.mean()), float(logs.var())
-    found = np.full(len(is_known), usual)
-    if spread > VARIANCE_OF_LOG:
-        found[is_known] += (1.0 - VARIANCE_OF_LOG / spread) * (logs - usual)
-    return np.asarray(np.exp(found))
+    found = without_chance(np.sqrt(np.nanmean(squares[:, is_known], axis=0)), FREEDOM)
+    inflation = np.full(len(is_known), np.exp(np.log(found).mean()))
+    inflation[is_known] = found
+    return inflation
 
 
 def _information_in(
     path: Path,
-) -> tuple[list[str], Array, Array, Array | None, dict[str, float]]:
+) -> tuple[list[str], Array, Array, Array | None, int, dict[str, float]]:
     """Names of the p parameters of a design or an estimate, information and prior: (p, p).
 
-    Of an estimate there are (p,) honest over formal standard deviations as well, and the noise of
-    its outputs.
+    Of an estimate there are (p,) honest over formal standard deviations as well, the number of its
+    recordings, and the noise of its outputs.
 
     Raises:
         RecordingError: The file has another content, or numbers that are not finite.
@@ -129,8 +132,13 @@ def _information_in(
         names = [str(name) for name in values["parameters"]]
         data, prior = (np.array(values[key], dtype=np.float64) for key in ("data", "prior"))
         ratio, noise = None, {}
+        count = len(values.get("recordings", ()))
         if "honest_std" in values:
             honest, formal = (np.array(values[k], dtype=np.float64) for k in ("honest_std", "std"))
+            covariance = np.array(values.get("honest_covariance", ()), dtype=np.float64)
+            if covariance.shape == (len(honest), len(honest)):
+                # A bound may cut intervals off, but not this covariance.
+                honest = np.sqrt(np.maximum(np.diag(covariance), 0.0))
             ratio = honest / np.where(formal > 0.0, formal, np.nan)
             noise = {str(name): float(s) for name, s in values.get("sigma", {}).items()}
     except (ValueError, KeyError, TypeError, AttributeError):
@@ -143,4 +151,4 @@ def _information_in(
             )
     if ratio is not None and ratio.shape != (len(names),):
         raise RecordingError(f"{path}: its honest_std and std are not {len(names)} numbers each")
-    return names, data, prior, ratio, noise
+    return names, data, prior, ratio, count, noise

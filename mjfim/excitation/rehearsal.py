@@ -167,7 +167,7 @@ def steps_along(
         predicted=predicted,
     )
     # Finite steps show what white noise would leave.
-    return replace(found, std=found.std * known.widening(found.std))
+    return replace(found, std=found.std * known.inflation)
 
 
 @one_blas_thread()

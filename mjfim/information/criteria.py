@@ -10,6 +10,7 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
+import scipy
 
 from mjfim.arrays import Array, record, scaled_to_unit_diagonal
 
@@ -218,6 +219,21 @@ def standard_deviations(information: Array) -> Array:
     scaled, scale = scaled_to_unit_diagonal(information)
     variances = np.sum(inverse_root(scaled) ** 2, axis=-1)
     return np.asarray(np.sqrt(np.nan_to_num(variances, nan=np.inf)) / scale)
+
+
+def without_chance(std: Array, freedom: int) -> Array:
+    """Standard deviations without that part of their differences that chance explains.
+
+    Their logarithms are shrunk to the mean (James & Stein, Estimation with quadratic loss, 1961).
+
+    Args:
+        std: (k,) positive standard deviations.
+        freedom: Degrees of freedom of each.
+    """
+    logs = np.log(std)
+    chance = 0.25 * float(scipy.special.polygamma(1, 0.5 * freedom))
+    kept = 1.0 - chance / max(float(logs.var()), chance)
+    return np.asarray(np.exp(logs.mean() + kept * (logs - logs.mean())))
 
 
 def inverse_root(information: Array) -> Array:

@@ -46,10 +46,6 @@ from mjfim.records.trajectory import Sensitivity
 # is below this number.
 ROUND_OFF_SHARE = 1e-6
 
-
-# All parameters.
-ALL = slice(None)
-
 # Largest number of samples at which accumulated standard deviations are computed.
 MAX_TIMES = 400
 
@@ -389,36 +385,6 @@ class FisherInformation:
             return information
         return information + np.diag((self.inflation**2 - 1.0) * self.stated_prior)
 
-    @cached_property
-    def _earlier_precision(self) -> Array:
-        """(p,) inverse variances by earlier experiments alone; 0 where they tell nothing."""
-        stated = 0.0 if self.stated_prior is None else np.diag(self.stated_prior)
-        earlier = self.prior - stated
-        precision = np.zeros(len(earlier))
-        known = np.diag(earlier) > ROUND_OFF_SHARE * np.diag(self.prior)
-        if known.any():
-            precision[known] = standard_deviations(earlier[np.ix_(known, known)]) ** -2.0
-        return precision
-
-    def widening(self, std: Array, among: np.ndarray | slice = ALL) -> Array:
-        """Factors by which residuals that are no white noise widen standard deviations.
-
-        What a model lacks does not average out over experiments. So errors of this one and of
-        earlier ones beyond white noise add as they are, and not as squares.
-
-        Args:
-            std: (..., k) standard deviations that white noise would leave [theta-unit].
-            among: Indices of the k parameters.
-
-        Returns:
-            (..., k) factors.
-        """
-        inflation = np.broadcast_to(self.inflation, len(self.scale))[among]
-        with np.errstate(invalid="ignore"):
-            share = np.clip(np.nan_to_num(std**2 * self._earlier_precision[among]), 0.0, 1.0)
-        together = np.sqrt(share) + np.sqrt(1.0 - share)
-        return np.asarray(np.sqrt(1.0 + (inflation**2 - 1.0) * together**2))
-
     def std(self, information: Array) -> Array:
         """Standard deviations of the parameters: those of Cramer and Rao, widened.
 
@@ -430,8 +396,7 @@ class FisherInformation:
             identifiable combination by itself.
         """
         if self.basis is None:
-            white = standard_deviations(self.under_white_noise(information))
-            return self.widening(white) * white
+            return self.inflation * standard_deviations(self.under_white_noise(information))
 
         std = np.full(information.shape[:-1], np.inf)
         variances = np.diagonal(self.covariance(information), axis1=-2, axis2=-1)
@@ -481,8 +446,7 @@ class FisherInformation:
         unit, size = scaled_to_unit_diagonal(R)
         root = inverse_root(unit) / size[..., None] / np.sqrt(self.measure_rate)
         axes = self.scale[t][:, None] * (basis @ root)
-        white = np.linalg.norm(axes, axis=-1)
-        axes = axes * self.widening(white, t)[..., None]
+        axes = axes * np.broadcast_to(self.inflation, len(self.scale))[t, None]
         return axes @ np.swapaxes(axes, -1, -2), basis
 
     # Identifiable combinations

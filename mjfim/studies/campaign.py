@@ -65,7 +65,8 @@ MIN_SAMPLING_RANGE = 1e-9
 def _known(estimate: Estimate) -> EarlierExperiments:
     """What the recordings so far tell, with the noise and the residuals that they show."""
     with np.errstate(divide="ignore", invalid="ignore"):
-        inflation = expected_inflation([estimate.honest_std / estimate.std])
+        ratio = np.sqrt(np.diag(estimate.honest_covariance)) / estimate.std
+    inflation = expected_inflation([(ratio, len(estimate.recordings))])
     return EarlierExperiments(information=estimate.data, inflation=inflation, sigma=estimate.sigma)
 
 

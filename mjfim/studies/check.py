@@ -524,26 +524,25 @@ def _checked(
     std[task.parameters.interest] = np.nan_to_num(spread, nan=np.inf)
 
     # Along one motion, standard deviations are checked by finite steps, and two robots show what it
-    # does not determine.
+    # does not determine. Recordings are fitted in segments, which respond otherwise.
     steps, robots, motion, known = None, None, point.trajectory, point.information
-    if not stop.requested and motion is not None and known is not None:
+    if is_motion and not stop.requested and motion is not None and known is not None:
         along = information.std(known)
         steps = steps_along(task, motion, known, along)
         odd = ~steps.confirmed
         std[odd] *= steps.std[odd] / along[odd]
-        if is_motion:
-            robots = valley(
-                [(task.plant, motion)],
-                task.system.noise,
-                task.theta,
-                information=known,
-                prior=information.prior,
-                std=std,
-            )
+        robots = valley(
+            [(task.plant, motion)],
+            task.system.noise,
+            task.theta,
+            information=known,
+            prior=information.prior,
+            std=std,
+        )
 
     # A motion that a robot could play is rehearsed as that of a design is.
     rehearsal, warning = None, ""
-    if is_motion and steps is not None and known is not None and motion is not None and not refused:
+    if steps is not None and known is not None and motion is not None and not refused:
         begin_stage("rehearsing the motion")
         gain, growth = regulation_along(task, motion)
         rehearsal = rehearsed(task, motion, gain, known, steps, growth)
@@ -551,7 +550,7 @@ def _checked(
 
     # What each sensor tells along one motion.
     worth = None
-    if steps is not None and is_motion:
+    if steps is not None:
         worth = sensing_along(task, point, found).worth(source, duration)
 
     # Eigenvalues of the criterion, without combinations that no experiment can identify.

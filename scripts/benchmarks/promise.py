@@ -1,11 +1,11 @@
 """Does the promised accuracy come true, and do two logs of one robot give one answer?
 
-    python -m scripts.benchmarks promise [--data ../shared/data] [--only NAME] [--logs 4]
+    python -m scripts.benchmarks promise [--data ../shared/data] [--only NAME] [--logs 3]
     python -m scripts.benchmarks promise --experiment FILE.toml LOG.csv ... [--seconds 12]
 
-Each log of a robot is fitted alone, and so are its two halves. From the second log on, `check`
-promises σ after all logs so far: by the stated noise at the guess, and with the estimate of the
-logs before as `earlier`. A fit of all logs so far then has the honest σ.
+Each set of the logs of a robot is fitted, and so are the two halves of each log. For each set of
+two logs or more, `check` promises σ by the stated noise at the guess, and from the estimate of all
+logs but one, each in turn, which is `earlier`. The fit of the set then has the honest σ.
 
 The simulated robots are plain MuJoCo loops whose dry friction grows with the load and falls with
 the speed. The fitted models have constant dry friction. Their encoders have steps, and each log has
@@ -18,7 +18,7 @@ import tempfile
 import time
 from collections.abc import Sequence
 from dataclasses import replace
-from itertools import chain, combinations, starmap
+from itertools import chain, combinations
 from pathlib import Path
 
 import mujoco
@@ -183,46 +183,53 @@ def share(flags: Sequence[bool]) -> str:
     return f"{100.0 * float(np.mean(flags)):.0f} % of {len(flags)}" if flags else "-"
 
 
+def experiment_after(
+    before: Estimate, experiment: mjfim.Experiment, system: System
+) -> mjfim.Experiment:
+    """The experiment at an estimate: its values are guesses, moved off the bounds."""
+    tables = {}
+    for value, each in zip(before.theta, system.parameters.parameters, strict=True):
+        if each.name in experiment.parameters:
+            low, high = each.bounds
+            gap = min(GAP * max(abs(each.guess), each.scale), 0.25 * (high - low))
+            guess = float(np.clip(value, low + gap, high - gap))
+            tables[each.name] = {"guess": guess, "scale": each.scale}
+    return experiment.replace(parameters=tables)
+
+
 def row_of(robot: str, experiment: mjfim.Experiment, logs: Sequence[mjfim.Recording]) -> list[str]:
     """Row of the table for one robot."""
     clock = time.process_time()
     system = System.resolve(experiment)
-    alone = [identify_system(system, [log]) for log in logs]
     split = []
     for log in logs:
         middle = len(log.t) // 2
         parts = [part_of(log, rows) for rows in (slice(middle), slice(middle, None))]
         split.append(agreement(*(identify_system(system, [part]) for part in parts)))
-    pairs = list(starmap(agreement, combinations(alone, 2)))
-    moved: set[str] = set()
 
+    # Fits of every set of logs, and promises before each set and before each further log of a set.
+    every = range(len(logs))
+    sets = [each for count in every for each in combinations(every, count + 1)]
+    found = {each: identify_system(system, [logs[i] for i in each]) for each in sets}
+    moved = {text for fit in found.values() for text in fit.warnings if "disagree" in text}
     ratios: tuple[list[float], list[float]] = ([], [])
-    found = alone[0]
-    for count in range(2, len(logs) + 1):
-        # The experiment at the estimate so far, which counts as `earlier`.
-        tables = {}
-        for name, value, own in zip(
-            found.parameters, found.theta, system.parameters.parameters, strict=True
-        ):
-            if name in experiment.parameters:
-                low, high = own.bounds
-                gap = min(GAP * max(abs(own.guess), own.scale), 0.25 * (high - low))
-                guess = float(np.clip(value, low + gap, high - gap))
-                tables[name] = {"guess": guess, "scale": own.scale}
-        with tempfile.TemporaryDirectory() as folder:
-            found.save(folder)
-            earlier = (f"{folder}/estimate.json",)
-            later = experiment.replace(parameters=tables, earlier=earlier)
-            checks = (
-                mjfim.check(experiment, logs[:count], progress=False),
-                mjfim.check(later, logs[count - 1 : count], progress=False),
-            )
-        found = identify_system(system, logs[:count])
-        moved |= {sentence for sentence in found.warnings if "disagree" in sentence}
-        for each, check in zip(ratios, checks, strict=True):
-            promise = [np.nan if row.nuisance else row.std for row in check.rows]
-            quotients = found.honest_std / promise
-            each += quotients[np.isfinite(quotients)].tolist()
+    for several in sets[len(logs) :]:
+        together = [logs[i] for i in several]
+        checks = [(0, mjfim.check(experiment, together, progress=False))]
+        for last in several:
+            before = found[tuple(i for i in several if i != last)]
+            later = experiment_after(before, experiment, system)
+            with tempfile.TemporaryDirectory() as folder:
+                before.save(folder)
+                later = later.replace(earlier=(f"{folder}/estimate.json",))
+                checks.append((1, mjfim.check(later, [logs[last]], progress=False)))
+        # A bound may cut intervals off, but not this covariance.
+        honest = np.sqrt(np.diag(found[several].honest_covariance))
+        honest[~np.isfinite(found[several].honest_std)] = np.nan
+        for kind, check in checks:
+            quotients = honest / [np.nan if row.nuisance else row.std for row in check.rows]
+            ratios[kind].extend(quotients[np.isfinite(quotients)].tolist())
+    pairs = [agreement(found[i,], found[j,]) for i, j in combinations(every, 2)]
     for sentence in sorted(moved):
         print(f"{robot}: {sentence}", flush=True)
 
@@ -241,7 +248,7 @@ def main() -> int:
     parser = options_of(__doc__)
     parser.add_argument("--data", type=Path, default=SHARED / "data")
     parser.add_argument("--only", help="name of one experiment")
-    parser.add_argument("--logs", type=int, default=4, help="largest number of logs of a robot")
+    parser.add_argument("--logs", type=int, default=3, help="largest number of logs of a robot")
     parser.add_argument("--experiment", type=Path, help="file of one robot, whose logs follow")
     parser.add_argument("files", type=Path, nargs="*", help="its logs")
     parser.add_argument("--seconds", type=float, default=np.inf, help="beginning of its logs")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import runpy
-import shutil
 from pathlib import Path
 
 import pytest
@@ -12,7 +11,7 @@ import pytest
 import mjfim
 from mjfim.errors import OutputError
 from mjfim.output import folders
-from mjfim.output.manifest import FOLDER_LOCK, MANIFEST, OutputGuard, claimed, locked
+from mjfim.output.manifest import FOLDER_LOCK, MANIFEST, OutputGuard, locked
 from mjfim.output.page import PictureFormat
 from tests.support.cli import misused, names, run, write_experiment
 from tests.support.contents import contents
@@ -28,17 +27,6 @@ def test_identify_does_not_replace_the_model_of_the_experiment(folder: Path) -> 
     result = run("identify study.toml run.csv -o fit --force")
     misused(result, "fit/identified.xml: this result would replace", "an input")
     assert contents(folder / "fit") == before
-
-
-def test_compare_keeps_an_earlier_result_that_it_reads(folder: Path) -> None:
-    """A control of an earlier comparison is the initial control now."""
-    control = folder / "control_chirp.csv"
-    with claimed(folder, OutputGuard([], force=False), exclusive=True):
-        folders.archive.write_table(control, {"t": [0.0]})
-    shutil.copy(folder / "cart_pendulum.csv", control)
-    write_experiment(folder, start='"control_chirp.csv"')
-    result = run("compare study.toml -o . --methods chirp --force")
-    misused(result, "control_chirp.csv: this result would replace", "an input")
 
 
 def test_a_second_run_does_not_enter_the_folder_of_the_first(folder: Path) -> None:

@@ -12,7 +12,7 @@ from scipy.special import polygamma
 
 from mjfim.errors import ExperimentError
 from mjfim.excitation.design import design_task
-from mjfim.excitation.prior_information import expected_inflation, known_from
+from mjfim.excitation.prior_information import known_from
 from mjfim.output import archive
 from mjfim.output.words import sigma_remark
 from mjfim.studies.check import check_task
@@ -79,10 +79,16 @@ def test_what_a_file_knows_is_found_by_name(case: str, tmp_path: Path) -> None:
 
 
 def estimate_file(path: Path, names: list[str], honest: list[float | None], **more: object) -> Path:
-    """An estimate.json with formal deviations of 0.1 and honest ones, which may be unknown."""
+    """An estimate.json with formal deviations of 0.1 and honest ones, which may be unknown.
+
+    It is that of two recordings, unless it states others. Bounds cut half of its intervals off.
+    """
     zero = np.zeros((len(names), len(names))).tolist()
-    values = {"parameters": names, "data": zero, "prior": zero, "sigma": {}, **more}
-    values |= {"std": [0.1] * len(names), "honest_std": honest}
+    values = {"parameters": names, "data": zero, "prior": zero, "sigma": {}}
+    covariance = np.diag([np.inf if each is None else each**2 for each in honest])
+    values |= {"std": [0.1] * len(names), "honest_covariance": covariance.tolist()}
+    values |= {"honest_std": [None if each is None else 0.5 * each for each in honest]}
+    values |= {"recordings": ["one", "two"], **more}
     path.write_text(json.dumps(values), encoding="utf-8")
     return path
 
@@ -99,43 +105,38 @@ def test_estimates_tell_how_much_wider_honest_deviations_are(tmp_path: Path) -> 
     chance = polygamma(1, 1.5) / 4.0
     kept = 1.0 - chance / np.var(logs)
     wanted = np.exp(logs.mean() + kept * (logs - logs.mean()))
-    assert_allclose(known.inflation[[0, 1, 3]], wanted, rtol=2e-3)
+    assert_allclose(known.inflation[[0, 1, 3]], wanted, rtol=1e-9)
+    assert f"(d) to {wanted[0]:.0f} (a) times" in sigma_remark(known.inflation, "abcd")
     assert known.inflation[2] == pytest.approx(np.exp(logs.mean()))
-    alike = estimate_file(tmp_path / "3.json", ["a", "b"], [0.2, 0.3])
+    # One of an earlier version has no such covariance.
+    alike = estimate_file(tmp_path / "3.json", ["a", "b"], [0.4, 0.6], honest_covariance=[])
     assert_allclose(known_from([alike], ("a", "b")).inflation, np.sqrt(6.0), rtol=1e-12)
     assert known.sigma == {"y": 2.0}
     design = design_file(tmp_path / "d.json", ["a"], np.eye(1))
     assert not len(known_from([design], ("a",)).inflation)
 
 
-def test_sigma_is_that_of_the_residuals_of_an_earlier_estimate(tmp_path: Path) -> None:
-    """Data count by the honest deviation and the noise of the estimate; stated priors do not."""
-    names, honest = ["m", "l", "c"], np.array([0.2, 5.0, 0.1])
-    ratio = expected_inflation([10.0 * honest])
+@pytest.mark.parametrize("recordings", [["one"], ["one", "two"]])
+def test_sigma_is_that_of_the_residuals_of_an_earlier_estimate(
+    recordings: list[str], tmp_path: Path
+) -> None:
+    """Data count by the honest deviation and the noise of the estimate; stated priors do not.
+
+    One recording shows half of the variance that a model which lacks something causes.
+    """
+    honest = np.array([0.3, 0.2, 0.25])
     parameters = {**CART_PARAMETERS, "l": {**CART_PARAMETERS["l"], "prior": 0.02}}
     white = cart_task(tmp_path, parameters=parameters)
     sigma = dict(zip(white.system.outputs.names, 3.0 * white.system.noise.sigma, strict=True))
-    path = estimate_file(tmp_path / "e.json", names, honest.tolist(), sigma=sigma)
-    task = cart_task(tmp_path, parameters=parameters, earlier=[str(path)])
-    data = (check_task(white).information - white.prior) / 9.0
+    data = check_task(white).information - white.prior
+    more = {"data": data.tolist(), "recordings": recordings, "sigma": sigma}
+    path = estimate_file(tmp_path / "e.json", ["m", "l", "c"], honest.tolist(), **more)
+    found = check_task(cart_task(tmp_path, parameters=parameters, earlier=[str(path)]))
+    squares = 1.0 + (3 - len(recordings)) * ((10.0 * honest) ** 2 - 1.0)
     prior = np.diag([0.0, 0.02**-2, 0.0])
-    wanted = np.linalg.inv(data / np.outer(ratio, ratio) + prior)
-    found = check_task(task)
+    wanted = np.linalg.inv((data / 9.0 + data) / squares.prod() ** (1.0 / 3.0) + prior)
     assert_allclose([row.std for row in found.rows], np.sqrt(np.diag(wanted)), rtol=1e-6)
     assert found.steps is not None and found.steps.confirmed.all()
-    assert f"(c) to {ratio[1]:.0f} (l) times" in sigma_remark(found.inflation, names)
-
-
-def test_what_a_model_lacks_does_not_average_out(tmp_path: Path) -> None:
-    """A repetition of an earlier experiment halves the variance of white noise, and no other."""
-    data = check_task(cart_task(tmp_path)).information
-    honest = np.array([0.2, 5.0, 0.1])
-    ratio = expected_inflation([10.0 * honest])
-    path = estimate_file(tmp_path / "e.json", ["m", "l", "c"], honest.tolist(), data=data.tolist())
-    found = check_task(cart_task(tmp_path, earlier=[str(path)]))
-    white = np.diag(np.linalg.inv(data))
-    wanted = np.sqrt(white / 2.0 + (ratio**2 - 1.0) * white)
-    assert_allclose([row.std for row in found.rows], wanted, rtol=1e-6)
 
 
 FAULTS = {

@@ -232,6 +232,27 @@ def test_residuals_that_are_alike_in_slow_parts_count_as_few_groups() -> None:
     assert_allclose(wide.interval[0], theta + np.array([-half, half]), rtol=1e-9)
 
 
+def test_groups_of_data_tell_about_all_unknowns_together() -> None:
+    """Unknowns of a wrong model that differ in four stages of the data, one more than the others.
+
+    Widths of those that err alike scatter less than by three degrees of freedom, and the intervals
+    of the one cover it as well.
+    """
+    rng, size = np.random.default_rng(7), np.array([6.0, *[2.0] * 11])
+    X = rng.choice([-1.0, 1.0], (1, 80 * FINE, 12))
+    sides = []
+    for _ in range(60):
+        stages = np.repeat(size * rng.standard_normal((4, 12)), 20 * FINE, axis=0)
+        y = np.sum(X * stages, axis=2) + noise(0.0, X.shape[:2], rng)
+        theta, condensed = Linear(X).fitted(y)
+        sides.append(assess(condensed, theta, FINE, is_white=False).interval)
+    low, high = np.moveaxis(sides, 2, 0)
+    covered = (low <= 0.0) & (high >= 0.0)
+    assert covered.mean() >= 0.95 and covered[:, 0].mean() >= 0.9
+    # It would be 0.48 with three degrees of freedom.
+    assert np.log(high - low)[:, 1:].std(axis=0).mean() < 0.36
+
+
 def test_blocks_are_four_autocorrelation_times_long() -> None:
     """A block has one row for white residuals, and at most a twentieth of the data."""
     assert block_length([1.0, 1.2], 10_000) == 1.0

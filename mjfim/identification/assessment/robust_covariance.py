@@ -16,6 +16,7 @@ import numpy as np
 import scipy
 
 from mjfim.arrays import NORMAL_95, Array, record, scaled_pseudo_inverse, scaled_to_unit_diagonal
+from mjfim.information.criteria import without_chance
 from mjfim.optimize.condensed_least_squares import Condensed
 
 # Length of an independent block over the autocorrelation time of the residuals.
@@ -315,8 +316,15 @@ def robust_uncertainty(
     for order in () if is_white or number < 2 else _orders(information):
         groups = np.array_split(order, number)
         of_groups = _sandwich(np.array([scores[g].sum(axis=0) for g in groups]), prior, root)
-        wide = np.hypot(np.sqrt(np.maximum(np.diag(of_groups), 0.0)), between)
-        half_width = np.maximum(half_width, t_quantile(number - 1) * wide)
+        # Few groups tell little about each unknown, and more about all of them: one of which they
+        # show a small scatter by chance has the usual one. Ratios below the floor change nothing.
+        t = t_quantile(number - 1)
+        ratio = np.sqrt(np.maximum(np.diag(of_groups), 0.0)) / np.maximum(formal, SMALLEST_VARIANCE)
+        ratio = np.maximum(ratio, NORMAL_95 / t)
+        if len(shared):
+            usual = without_chance(ratio[shared], number - 1)
+            ratio[shared] = np.maximum(ratio[shared], usual)
+        half_width = np.maximum(half_width, t * np.hypot(formal * ratio, between))
     low, high = theta - half_width, theta + half_width
     if len(replicates):
         tails = np.quantile(replicates, [0.5 - LEVEL / 2.0, 0.5 + LEVEL / 2.0], axis=0)
