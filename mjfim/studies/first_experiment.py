@@ -681,7 +681,7 @@ class _Refinement:
         rest = task.control[:1]
         try:
             motion = task.plant.simulate(task.theta, rest + shares * (task.control - rest))
-            found = verify(task, motion)
+            found = verify(task, motion, briefly=True)
         except SimulationDivergedError:
             return -np.inf
         if not found.is_feasible:

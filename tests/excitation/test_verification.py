@@ -59,8 +59,12 @@ def test_a_clearance_holds_between_the_samples_too(tmp_path: Path) -> None:
     assert constraints.margins(along_control(task, constraints))["clearance"] > 0.05
     found = verify(task, task.initial)
     assert found.margins["clearance"] == pytest.approx(0.19 - SWING - 0.1, abs=1e-4)
+    assert verify(task, task.initial, briefly=True).margins == found.margins
     assert not found.is_feasible
     assert verify(spring_task(tmp_path, limits={"clearance": 0.035}), task.initial).is_feasible
+    # Where another limit is violated, no distance is measured.
+    task = spring_task(tmp_path, limits={"clearance": 0.1, "position": {"slide": (-0.1, 0.1)}})
+    assert verify(task, task.initial, briefly=True).margins.keys() == {"position"}
 
     # It is measured beyond the reach of distances as well.
     still = {"initial": {"qvel": (1e-9,)}, "control": {"kind": "constant", "amplitude": 0.0}}

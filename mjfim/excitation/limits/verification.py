@@ -16,7 +16,6 @@ import numpy as np
 from mjfim.arrays import Array
 from mjfim.errors import ExperimentError
 from mjfim.excitation.limits.constraint_kinds import (
-    ClearanceConstraint,
     ConstraintValues,
     ControlConstraint,
     ControlRateConstraint,
@@ -81,12 +80,14 @@ class Verification:
         )
 
 
-def verify(task: DesignTask, trajectory: Trajectory) -> Verification:
+def verify(task: DesignTask, trajectory: Trajectory, *, briefly: bool = False) -> Verification:
     """Play the control of a trajectory open loop on the unmodified model, at the theta of the task.
 
     Args:
         task: The task; all stated limits are checked, enforced or not.
         trajectory: The designed trajectory.
+        briefly: Whether margins matter only where all limits hold, and usage not at all. Where
+            another limit is violated, distances of geoms, which take longest, are not measured.
 
     Returns:
         Margins and usage of all limits; infinitely negative margins where the simulation diverges.
@@ -94,7 +95,9 @@ def verify(task: DesignTask, trajectory: Trajectory) -> Verification:
     constraints = constraint_set_of(task, every=True)
     model = task.system.model_at(task.theta)
     exact = _played(task, constraints, trajectory.ctrl, model)
-    found = _verification(task, constraints, trajectory, exact, model)
+    found = _verification(task, constraints, trajectory, exact, model, briefly)
+    if briefly and not found.is_feasible:
+        return found
     # Without constraint forces, the settings of their solver do not matter.
     if exact is None or unconstrained(model) or not np.isfinite(found.deviation):
         return found
@@ -108,7 +111,7 @@ def verify(task: DesignTask, trajectory: Trajectory) -> Verification:
         and np.array_equal(stated.observed, exact.observed)
     ):
         return found
-    return _worse_of(found, _verification(task, constraints, trajectory, stated, model))
+    return _worse_of(found, _verification(task, constraints, trajectory, stated, model, briefly))
 
 
 def _played(
@@ -133,6 +136,7 @@ def _verification(
     trajectory: Trajectory,
     values: ConstraintValues | None,
     model: Any,
+    briefly: bool,
 ) -> Verification:
     """Check all limits of a trajectory along its control as one model plays it.
 
@@ -142,6 +146,7 @@ def _verification(
         trajectory: The trajectory.
         values: What `_played` returns for the model.
         model: The model.
+        briefly: See `verify`.
     """
     unenforced = frozenset[str]()
     if not task.experiment.limits.enforce:
@@ -166,11 +171,21 @@ def _verification(
 
     # The clearance, at every engine step instead of at the samples.
     clearance = constraints.clearance
-    if clearance is not None:
+    if clearance is not None and (
+        not briefly or all(margins[kind] >= 0.0 for kind in margins.keys() - unenforced)
+    ):
         held = np.repeat(motion.ctrl, task.system.grid.substeps, axis=0)
         steps = BatchSimulator(model).rollout([model], motion.state[:1], held[None]).states[0]
-        distance, used = _clearance_usage(task, clearance, steps[1:, : task.space.nq])
-        usage.append(used)
+        positions = steps[1:, : task.space.nq]
+        distance, pair = clearance.distances.nearest(positions)
+        if not briefly:
+            nearest = clearance.distances(positions, slopes=False)[0].min(axis=1)
+            distance = nearest.min(where=nearest < clearance.distances.reach, initial=distance)
+            t = _engine_times(task, len(positions))
+            share = clearance.least / np.maximum(nearest, CONTACT_SHARE * clearance.least)
+            usage.append(
+                LimitUsage(kind="clearance", name=pair, t=t, share=share, lower=clearance.least)
+            )
         margins["clearance"] = distance - clearance.least
         relative_margins["clearance"] = margins["clearance"] / clearance.least
 
@@ -187,7 +202,8 @@ def _verification(
 
 def _worse_of(exact: Verification, stated: Verification) -> Verification:
     """Join the verifications with the exact solver and with the solver settings of the MJCF."""
-    if not np.isfinite(stated.deviation):
+    # A simulation that diverges, or in which another limit is violated already, has no clearance.
+    if stated.margins.keys() != exact.margins.keys():
         return stated
 
     by_stated_solver = frozenset(
@@ -274,30 +290,6 @@ def _bounded_usage(
         )
 
 
-def _clearance_usage(
-    task: DesignTask, clearance: ClearanceConstraint, positions: Array
-) -> tuple[float, LimitUsage]:
-    """Smallest distance [m] over n engine steps, and the usage of the clearance over time.
-
-    Args:
-        task: The task.
-        clearance: The clearance.
-        positions: (n, nq) positions after each engine step.
-    """
-    nearest = clearance.distances(positions, slopes=False)[0].min(axis=1)
-
-    # Where geoms come within reach, the engine step at which they are nearest is known by now.
-    row = int(nearest.argmin())
-    is_within_reach = nearest[row] < clearance.distances.reach
-    candidates = positions[row : row + 1] if is_within_reach else positions
-    distance, _, pair = clearance.distances.nearest(candidates)
-
-    t = _engine_times(task, len(positions))
-    share = clearance.least / np.maximum(nearest, CONTACT_SHARE * clearance.least)
-    used = LimitUsage(kind="clearance", name=pair, t=t, share=share, lower=clearance.least)
-    return distance, used
-
-
 def _engine_times(task: DesignTask, count: int) -> Array:
     """(count,) times after each engine step [s]."""
     return np.arange(1, count + 1) * task.dt / task.system.grid.substeps
@@ -346,7 +338,7 @@ def _require_inside(task: DesignTask, constraints: ConstraintSet, where: str, st
     clearance = constraints.clearance
     if clearance is None:
         return
-    distance, _, pair = clearance.distances.nearest(state[None, : task.space.nq])
+    distance, pair = clearance.distances.nearest(state[None, : task.space.nq])
     if distance < clearance.least:
         fault = "in collision" if distance < 0.0 else "too close"
         raise ExperimentError(

@@ -88,7 +88,7 @@ class DescentLevel:
         """Check the limits along a motion, also on the unmodified model."""
         if values is None or not self.constraints.is_feasible(values):
             return False
-        return verify(self.task, values.trajectory).is_feasible
+        return verify(self.task, values.trajectory, briefly=True).is_feasible
 
     def point_along(self, values: ConstraintValues | None) -> DesignPoint | None:
         """Evaluate a motion, inside limits or not; None where it diverges."""
