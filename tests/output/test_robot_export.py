@@ -25,7 +25,7 @@ from mjfim.output.export.trajectories import (
 from mjfim.recordings import read_recording
 from mjfim.recordings.formats import read_table
 from tests.output.conftest import Designed, designed
-from tests.support.cli import done, misused, names, run
+from tests.support.cli import done, names
 from tests.support.paths import MODELS
 
 pytest.importorskip("rosbags", reason="the extra `ros` is not installed")
@@ -139,16 +139,13 @@ def test_a_bag_is_read_by_rosbags_and_as_a_recording(
     assert_array_equal(recording.y[:, columns], design.trajectory.qpos)
 
 
-def test_the_verb_writes_and_replaces_its_own_files_only(folder: Path, tmp_path: Path) -> None:
-    """A bag replaces one of the other format; no input is replaced, even with --force."""
+def test_a_bag_replaces_one_of_the_other_format(folder: Path, tmp_path: Path) -> None:
     bag = tmp_path / "bag"
     experiment = MODELS / "cart_pendulum.toml"
     words = ("export", folder, "--experiment", experiment, "-o")
     for storage, ending in (("sqlite3", "db3"), ("mcap", "mcap")):
         done(*words, bag, "--to", "ros2-bag", "--storage", storage)
         assert names(bag) == {".mjfim.json", "metadata.yaml", f"bag.{ending}"}
-
-    misused(run(*words, folder / "design.csv", "--to", "ros2", "--force"), "is an input")
 
 
 def test_a_robot_without_driven_joints_has_no_joint_trajectory(tmp_path: Path) -> None:
