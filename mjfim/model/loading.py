@@ -122,7 +122,8 @@ def compile_spec(spec: Any, path: Path, *, tells: bool = False, files: Any = Non
         with collected_warnings() as found:
             model = spec.compile(files)
     except (ValueError, mujoco.FatalError) as error:
-        raise ModelError(f"{path}: MuJoCo cannot compile the model: {str(error).strip()}") from None
+        told = str(error).removeprefix("Error: ").strip()
+        raise ModelError(f"{path}: MuJoCo cannot compile the model: {told}") from None
 
     if tells:
         tell_once(path, (f"MuJoCo warns: {text}" for text in found))
