@@ -224,7 +224,8 @@ def standard_deviations(information: Array) -> Array:
 def without_chance(std: Array, freedom: int) -> Array:
     """Standard deviations without that part of their differences that chance explains.
 
-    Their logarithms are shrunk to the mean (James & Stein, Estimation with quadratic loss, 1961).
+    Their logarithms are shrunk to the mean (empirical Bayes, after James & Stein, Estimation with
+    quadratic loss, 1961).
 
     Args:
         std: (k,) positive standard deviations.

@@ -177,12 +177,17 @@ def _verification(
         held = np.repeat(motion.ctrl, task.system.grid.substeps, axis=0)
         steps = BatchSimulator(model).rollout([model], motion.state[:1], held[None]).states[0]
         positions = steps[1:, : task.space.nq]
-        distance, pair = clearance.distances.nearest(positions)
-        if not briefly:
+        if briefly:
+            distance, _ = clearance.distances.nearest(positions)
+        else:
             nearest = clearance.distances(positions, slopes=False)[0].min(axis=1)
-            distance = nearest.min(where=nearest < clearance.distances.reach, initial=distance)
             t = _engine_times(task, len(positions))
             share = clearance.least / np.maximum(nearest, CONTACT_SHARE * clearance.least)
+            # Within reach, the engine step at which geoms are nearest is known by now.
+            row = int(nearest.argmin())
+            is_within_reach = nearest[row] < clearance.distances.reach
+            candidates = positions[row : row + 1] if is_within_reach else positions
+            distance, pair = clearance.distances.nearest(candidates)
             usage.append(
                 LimitUsage(kind="clearance", name=pair, t=t, share=share, lower=clearance.least)
             )

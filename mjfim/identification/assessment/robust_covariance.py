@@ -313,18 +313,27 @@ def robust_uncertainty(
         NORMAL_95 * np.hypot(formal, between), factor * NORMAL_95 * np.hypot(sandwich, between)
     )
     number = min(GROUPS, count // 2)
+    # Parts of the formal covariance that come from the priors, and from the data.
+    by_prior, by_data = (
+        np.sqrt(np.maximum(np.diag(_in_unknowns(root.T @ each @ root, root)), 0.0))
+        for each in (prior, of_data)
+    )
     for order in () if is_white or number < 2 else _orders(information):
         groups = np.array_split(order, number)
-        of_groups = _sandwich(np.array([scores[g].sum(axis=0) for g in groups]), prior, root)
+        sums = np.array([scores[g].sum(axis=0) for g in groups])
+        scatter = np.diag(_sandwich(sums, np.zeros_like(prior), root))
         # Few groups tell little about each unknown, and more about all of them: one of which they
-        # show a small scatter by chance has the usual one. Ratios below the floor change nothing.
+        # show a small scatter by chance is raised towards the usual one. Priors stay as they are.
+        # Ratios below the floor change nothing.
         t = t_quantile(number - 1)
-        ratio = np.sqrt(np.maximum(np.diag(of_groups), 0.0)) / np.maximum(formal, SMALLEST_VARIANCE)
+        ratio = np.sqrt(np.maximum(scatter, 0.0)) / np.maximum(by_data, SMALLEST_VARIANCE)
         ratio = np.maximum(ratio, NORMAL_95 / t)
-        if len(shared):
-            usual = without_chance(ratio[shared], number - 1)
-            ratio[shared] = np.maximum(ratio[shared], usual)
-        half_width = np.maximum(half_width, t * np.hypot(formal * ratio, between))
+        common = shared[by_data[shared] > 0.0]
+        if len(common):
+            usual = without_chance(ratio[common], number - 1)
+            ratio[common] = np.maximum(ratio[common], usual)
+        wide = np.sqrt((by_data * ratio) ** 2 + by_prior**2 + between**2)
+        half_width = np.maximum(half_width, t * wide)
     low, high = theta - half_width, theta + half_width
     if len(replicates):
         tails = np.quantile(replicates, [0.5 - LEVEL / 2.0, 0.5 + LEVEL / 2.0], axis=0)
