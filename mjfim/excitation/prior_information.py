@@ -12,7 +12,7 @@ from mjfim.arrays import Array, record
 from mjfim.errors import ExperimentError, RecordingError, listed
 from mjfim.experiment.parameters import INITIAL_STATE_PREFIX
 from mjfim.files import read_json
-from mjfim.information.criteria import marginal, without_chance
+from mjfim.information.criteria import GROUPS, marginal, without_chance
 
 
 @record
@@ -90,11 +90,6 @@ def known_from(paths: Sequence[Path], names: Sequence[str]) -> EarlierExperiment
     return EarlierExperiments(information=total, inflation=inflation, sigma=sigma)
 
 
-# Degrees of freedom of honest standard deviations, which come from the scatter between four groups
-# of data.
-FREEDOM = 3
-
-
 def expected_inflation(estimates: Sequence[tuple[Array, int]]) -> Array:
     """(p,) inflations that are expected after those of estimates, as `known_from` returns them.
 
@@ -110,7 +105,7 @@ def expected_inflation(estimates: Sequence[tuple[Array, int]]) -> Array:
     parts = np.array([[2.0 if count == 1 else 1.0] for _, count in estimates])
     squares = 1.0 + parts * (np.maximum(known, 1.0) ** 2 - 1.0)
     is_known = np.isfinite(squares).any(axis=0)
-    found = without_chance(np.sqrt(np.nanmean(squares[:, is_known], axis=0)), FREEDOM)
+    found = without_chance(np.sqrt(np.nanmean(squares[:, is_known], axis=0)), GROUPS - 1)
     inflation = np.full(len(is_known), np.exp(np.log(found).mean()))
     inflation[is_known] = found
     return inflation

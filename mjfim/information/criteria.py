@@ -221,6 +221,12 @@ def standard_deviations(information: Array) -> Array:
     return np.asarray(np.sqrt(np.nan_to_num(variances, nan=np.inf)) / scale)
 
 
+# Number of groups of data whose scatter shows honest standard deviations where residuals are no
+# white noise. A model that lacks a term errs alike in all rows of a kind: only few groups are
+# independent (Ibragimov & Müller 2010).
+GROUPS = 4
+
+
 def without_chance(std: Array, freedom: int) -> Array:
     """Standard deviations without that part of their differences that chance explains.
 

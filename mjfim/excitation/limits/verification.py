@@ -169,38 +169,41 @@ def _verification(
     if constraints.rate is not None:
         usage.extend(_bounded_usage(task, constraints.rate, values))
 
-    # The clearance, at every engine step instead of at the samples.
-    clearance = constraints.clearance
-    if clearance is not None and (
-        not briefly or all(margins[kind] >= 0.0 for kind in margins.keys() - unenforced)
-    ):
-        held = np.repeat(motion.ctrl, task.system.grid.substeps, axis=0)
-        steps = BatchSimulator(model).rollout([model], motion.state[:1], held[None]).states[0]
-        positions = steps[1:, : task.space.nq]
-        if briefly:
-            distance, _ = clearance.distances.nearest(positions)
-        else:
-            nearest = clearance.distances(positions, slopes=False)[0].min(axis=1)
-            t = _engine_times(task, len(positions))
-            share = clearance.least / np.maximum(nearest, CONTACT_SHARE * clearance.least)
-            # Within reach, the engine step at which geoms are nearest is known by now.
-            row = int(nearest.argmin())
-            is_within_reach = nearest[row] < clearance.distances.reach
-            candidates = positions[row : row + 1] if is_within_reach else positions
-            distance, pair = clearance.distances.nearest(candidates)
-            usage.append(
-                LimitUsage(kind="clearance", name=pair, t=t, share=share, lower=clearance.least)
-            )
-        margins["clearance"] = distance - clearance.least
-        relative_margins["clearance"] = margins["clearance"] / clearance.least
-
     difference = task.space.minus(motion.state, trajectory.state)
-    deviation = float(np.abs(difference / task.sizes[: task.space.nx]).max())
-    return Verification(
+    found = Verification(
         margins=margins,
         relative_margins=relative_margins,
-        deviation=deviation,
+        deviation=float(np.abs(difference / task.sizes[: task.space.nx]).max()),
         unenforced=unenforced,
+        usage=tuple(usage),
+    )
+    clearance = constraints.clearance
+    if clearance is None or (briefly and not found.is_feasible):
+        return found
+
+    # The clearance, at every engine step instead of at the samples.
+    held = np.repeat(motion.ctrl, task.system.grid.substeps, axis=0)
+    steps = BatchSimulator(model).rollout([model], motion.state[:1], held[None]).states[0]
+    positions = steps[1:, : task.space.nq]
+    if briefly:
+        distance, _ = clearance.distances.nearest(positions)
+    else:
+        nearest = clearance.distances(positions, slopes=False)[0].min(axis=1)
+        t = _engine_times(task, len(positions))
+        share = clearance.least / np.maximum(nearest, CONTACT_SHARE * clearance.least)
+        # Within reach, the engine step at which geoms are nearest is known by now.
+        row = int(nearest.argmin())
+        is_within_reach = nearest[row] < clearance.distances.reach
+        candidates = positions[row : row + 1] if is_within_reach else positions
+        distance, pair = clearance.distances.nearest(candidates)
+        usage.append(
+            LimitUsage(kind="clearance", name=pair, t=t, share=share, lower=clearance.least)
+        )
+    margin = distance - clearance.least
+    return replace(
+        found,
+        margins={**margins, "clearance": margin},
+        relative_margins={**relative_margins, "clearance": margin / clearance.least},
         usage=tuple(usage),
     )
 

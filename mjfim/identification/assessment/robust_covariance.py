@@ -16,7 +16,7 @@ import numpy as np
 import scipy
 
 from mjfim.arrays import NORMAL_95, Array, record, scaled_pseudo_inverse, scaled_to_unit_diagonal
-from mjfim.information.criteria import without_chance
+from mjfim.information.criteria import GROUPS, without_chance
 from mjfim.optimize.condensed_least_squares import Condensed
 
 # Length of an independent block over the autocorrelation time of the residuals.
@@ -213,10 +213,6 @@ MAX_CONDITION_OF_DRAW = 1e14
 # Smallest variance in a denominator.
 SMALLEST_VARIANCE = 1e-300
 
-# Number of groups of blocks where residuals are no white noise. A model that lacks a term errs
-# alike in all rows of a kind: only few groups are independent (Ibragimov & Müller 2010).
-GROUPS = 4
-
 
 @record
 class Uncertainty:
@@ -313,11 +309,8 @@ def robust_uncertainty(
         NORMAL_95 * np.hypot(formal, between), factor * NORMAL_95 * np.hypot(sandwich, between)
     )
     number = min(GROUPS, count // 2)
-    # Parts of the formal covariance that come from the priors, and from the data.
-    by_prior, by_data = (
-        np.sqrt(np.maximum(np.diag(_in_unknowns(root.T @ each @ root, root)), 0.0))
-        for each in (prior, of_data)
-    )
+    # The part of the formal deviations that comes from the data.
+    by_data = np.sqrt(np.maximum(np.diag(_in_unknowns(root.T @ of_data @ root, root)), 0.0))
     for order in () if is_white or number < 2 else _orders(information):
         groups = np.array_split(order, number)
         sums = np.array([scores[g].sum(axis=0) for g in groups])
@@ -332,7 +325,7 @@ def robust_uncertainty(
         if len(common):
             usual = without_chance(ratio[common], number - 1)
             ratio[common] = np.maximum(ratio[common], usual)
-        wide = np.sqrt((by_data * ratio) ** 2 + by_prior**2 + between**2)
+        wide = np.sqrt(formal**2 + (ratio**2 - 1.0) * by_data**2 + between**2)
         half_width = np.maximum(half_width, t * wide)
     low, high = theta - half_width, theta + half_width
     if len(replicates):
