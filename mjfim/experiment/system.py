@@ -332,7 +332,7 @@ class System:
 
     @property
     def coordinates(self) -> tuple[ScalarJoint, ...]:
-        """All slide and hinge joints."""
+        """All slide and hinge joints but those that physical terms have added."""
         return self.source.coordinates.scalar_joints
 
     @property

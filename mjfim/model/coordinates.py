@@ -127,7 +127,7 @@ class ModelCoordinates:
 
     Attributes:
         controls: Names of the nu controls.
-        scalar_joints: All slide and hinge joints.
+        scalar_joints: All slide and hinge joints but those that physical terms have added.
         unnamed_joints: Number of joints without a name in the MJCF.
         state: The nq + nv numbers of the state that can be measured.
         sensors: The numbers of all sensors with a name.
@@ -152,7 +152,7 @@ class ModelCoordinates:
         components = state_components(model)
         return cls(
             controls=control_names(model),
-            scalar_joints=scalar_joints(model),
+            scalar_joints=tuple(each for each in scalar_joints(model) if each.q not in added),
             unnamed_joints=unnamed_count(model, "joint"),
             state=tuple(replace(each, is_added=each.address in added) for each in components),
             sensors=sensor_components(model),

@@ -42,8 +42,8 @@ SHARED_ORIGIN = DifferenceAccuracy(
     central=False, coordinate_step=1e-6, direction_step=1e-3, shared_origin=True
 )
 
-# One-sided in everything with a short step, for a plant with smoothed dry friction, whose
-# derivatives change quickly.
+# One-sided in everything with a short step, for a plant with smoothed dry friction or with impacts
+# of a term, whose derivatives change quickly.
 SHARED_ORIGIN_SHORT = DifferenceAccuracy(
     central=False, coordinate_step=1e-6, direction_step=1e-5, shared_origin=True
 )
@@ -87,7 +87,8 @@ class MixedDerivatives(FirstDerivatives):
     @property
     def quickest_accuracy(self) -> DifferenceAccuracy:
         """The quickest differences for mixed second derivatives of this plant."""
-        return SHARED_ORIGIN_SHORT if self.plant.smooth.source.smoothing_speeds else SHARED_ORIGIN
+        jumps = self.plant.smooth.source.smoothing_speeds or not self.plant.is_free.all()
+        return SHARED_ORIGIN_SHORT if jumps else SHARED_ORIGIN
 
     def bilinear(
         self,
@@ -148,7 +149,7 @@ class MixedDerivatives(FirstDerivatives):
 
         F_mixed, of_sensors = [], []
         for number, w in enumerate(directions):
-            along = psi @ w
+            along = (psi @ w) * plant.is_free
             epsilon = self.direction_step(accuracy.direction_step, along / sizes[: space.nx], w)
             distances = np.array([epsilon] if has_origin else [epsilon, -epsilon])
             at = theta + distances[:, None] * w

@@ -472,6 +472,11 @@ class LoadDependentFriction(Term):
             quantities=stated_quantities(cls.kind, table, {"coefficient": quantity}),
         )
 
+    @property
+    def held_joints(self) -> tuple[str, ...]:
+        """The slide of the ball."""
+        return (self.name,)
+
     def edit(self, spec: Any) -> None:
         """Add the ball, the buffers, their contacts and the tendon."""
         spec.option.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_CONTACT)

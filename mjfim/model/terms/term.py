@@ -155,6 +155,11 @@ class Term(ABC):
         """
         return [({}, ())]
 
+    @property
+    def held_joints(self) -> tuple[str, ...]:
+        """Joints that it adds and that contacts hold, whose impacts have no derivative."""
+        return ()
+
     @abstractmethod
     def edit(self, spec: Any) -> None:
         """Add the elements of the term to an MjSpec, in place."""
