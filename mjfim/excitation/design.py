@@ -185,9 +185,9 @@ def design_task(
         if best.trajectory.ctrl.shape == task.control.shape:
             initial_control = best.trajectory.ctrl
         reserve |= needed
-    # A later design knows what the robots need; after Ctrl-C it is not rehearsed.
+    # A later design knows what the robots need; after Ctrl-C it is not rehearsed, nor are cures.
     best = max(reversed(found), key=lambda each: each.rehearsal is not None and is_playable(each))
-    if best.rehearsal is None:
+    if best.rehearsal is None or budget.stop.requested:
         return best
     played = task.released_as(best.trajectory.state[0])
     return replace(best, rehearsal=with_cures_tried(played, best.final, best.rehearsal))

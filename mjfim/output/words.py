@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence, Sized
+from collections.abc import Callable, Iterable, Sequence, Sized
 
 import numpy as np
 
@@ -15,6 +15,9 @@ from mjfim.records.estimate import Prediction
 
 # Digits of a power of ten, raised.
 SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+
+# Largest number of widths of a shortened name that must differ from others.
+MOST_WIDTHS = 4
 
 # ---- units
 
@@ -122,17 +125,27 @@ def format_percent(value: float) -> str:
     return f"{format_number(100.0 * value, 2)} %"
 
 
-def shorten(text: str, width: int = 28) -> str:
+def shorten(text: str, width: int = 28, among: Iterable[str] = ()) -> str:
     """Shorten a long name; both of its ends stay, with an ellipsis between them.
+
+    Names beside it stay different: the ellipsis moves, and a longer text stays where this is not
+    enough.
 
     Args:
         text: The name.
-        width: Largest number of characters.
+        width: Largest number of characters, where this tells the names apart.
+        among: Names beside it.
     """
-    if len(text) <= width:
-        return text
-    kept = (width - 1) // 2
-    return f"{text[:kept]}…{text[-kept:]}"
+    names = [text, *({*among} - {text})]
+    for kept in range(width - 1, MOST_WIDTHS * width):
+        for head in sorted(range(1, kept), key=lambda head: abs(2 * head - kept)):
+            short, *others = (
+                name if len(name) <= kept + 1 else f"{name[:head]}…{name[head - kept :]}"
+                for name in names
+            )
+            if short not in others:
+                return short
+    return text
 
 
 def share_note(shown: Sized, every: Sized, which: str) -> str:

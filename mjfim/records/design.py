@@ -420,8 +420,8 @@ class Design(ParameterResult):
         limits: Worst margin per kind of limit, positive inside [unit of the limit].
         usage: Position between the bounds of every limit, at every engine step.
         initial_violations: Limits that the initial trajectory violates.
-        scaled_start: The largest share of the initial control that keeps all limits, where the
-            initial control violates one; None where it does not, or where no share keeps them.
+        scaled_start: The largest share of the initial control that keeps all limits with the
+            reserve, where the initial control does not; None where it does, or where no share does.
         warnings: Sentences for the user.
         found_by: Name of the initial control that led to the design.
         starts: Results of all initial controls.
@@ -544,14 +544,14 @@ class Design(ParameterResult):
     @property
     def is_start(self) -> bool:
         """True if the cost and σ are, within 2 %, those of a start that keeps all limits."""
-        if self.initial_violations:
-            # What keeps them is the scaled initial control, of which the worst σ is known.
-            start = self.scaled_start
-            if start is None:
-                return False
+        start = self.scaled_start
+        if start is not None:
+            # What keeps them, with the reserve, is the scaled initial control.
             before = [start.cost, start.min_eigenvalue**-0.5]
             after = [self.final.cost, float(self.final.eigenvalues[0]) ** -0.5]
             return np.allclose(before, after, rtol=TIE_TOLERANCE, atol=0.0)
+        if self.initial_violations:
+            return False
 
         wanted = list(self.wanted)
         before = [self.initial.cost, *self.initial.std[wanted]]

@@ -19,7 +19,7 @@ from mjfim.output.pages import page_of
 from mjfim.output.pages.estimate import selection_parts
 from mjfim.output.rerun.documents import as_markdown
 from mjfim.output.terminal import laid_out
-from mjfim.output.words import improvement, relative
+from mjfim.output.words import improvement, relative, shorten
 from mjfim.records.base import Level, ShownRecord, Verdict, listed_values
 from mjfim.records.check import findings_of_check
 from mjfim.records.design import LimitViolation, ScaledStart, Status
@@ -237,7 +237,7 @@ def test_a_start_outside_its_limits_is_equal_to_its_scaled_control() -> None:
     scaled = ScaledStart(share=0.5, cost=1.01, min_eigenvalue=0.99)
     outside = {"initial_violations": (violation,), **STOPPED}
     for start, is_equal in ((scaled, True), (replace(scaled, min_eigenvalue=0.9), False)):
-        design = results.design(scaled_start=start, **outside)
+        design = results.design(scaled_start=start, **STOPPED)
         assert (design.is_start, design.verdict.ok) == (is_equal, not is_equal)
     assert not results.design(**outside).is_start
     # A share that determines nothing is no measure.
@@ -269,13 +269,20 @@ def test_what_nothing_limits_and_every_end_in_motion_is_said() -> None:
         unplaced=joints,
     )
     text = page_of(rehearsal).verdict.sentence
-    places = "up to 2.1 rad (hinge) and 0.8 m (cart) from the start."
-    assert f"3 positions have no limit, {places}" in text
-    assert "1 speed has no limit, up to 3 rad/s (hinge)." in text
-    assert "It ends in motion: hinge at 0.85 rad/s, cart at 0.56 m/s." in text
+    assert text.startswith("Safe to play, then stop it or let it swing out.")
+    assert text.endswith(
+        "3 positions have no limit, up to 2.1 rad (hinge) and 0.8 m (cart) from the start. "
+        "1 speed has no limit, up to 3 rad/s (hinge). "
+        "It ends in motion: hinge at 0.85 rad/s, cart at 0.56 m/s."
+    )
     resting = replace(rehearsal, end_speed=0.01 * rehearsal.speed, unlimited=(), unplaced=())
     text = page_of(resting).verdict.sentence
     assert text.endswith("It ends at rest.") and "no limit" not in text
+
+
+def test_shortened_names_stay_different() -> None:
+    short = shorten("armature_joint_0_and_2_more", 18, ["armature_joint_3_and_2_more"])
+    assert short == "armat…0_and_2_more"
 
 
 REPEATED = tuple(replace(row, repetitions=4) for row in results.check().rows)

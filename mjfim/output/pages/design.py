@@ -31,6 +31,7 @@ from mjfim.output.pages.worth import worth_parts
 from mjfim.output.words import (
     BEST_CASE,
     NOT_ALONE,
+    format_percent,
     improvement,
     relative,
     sigma_remark,
@@ -56,6 +57,9 @@ from mjfim.records.rehearsal import REST_SHARE, Fan, LimitRange, Rehearsal, Vall
 
 # Ratio of two standard deviations above which one of them counts as smaller.
 RELEVANT_RATIO = 1.05
+
+# Ratio of the largest σ of a start to that of its design below which a verdict states the gain.
+SMALL_GAIN = 1.1
 
 # Largest number of limits that the initial control violates and that a page lists.
 MAX_VIOLATIONS = 4
@@ -152,11 +156,32 @@ def _verdict(design: Design) -> Verdict:
         reservation = f"it hardly determines {_with_widest(design, poorly)}"
     if not (ok or reservation):
         reservation = "the search was interrupted"
-    equal = "It is no better than its start. " if design.is_start else ""
     if reservation:
-        text = f"This motion can be played, but {reservation}. {equal}{seen}"
+        text = f"This motion can be played, but {reservation}. {_gain(design)}{seen}"
         return Verdict(text, Level.DOUBTFUL, ok)
-    return Verdict(f"Ready to play: {_accuracy(design)}. {equal}{seen}", Level.GOOD, ok)
+    text = f"Ready to play{_at_end(rehearsal)}: {_accuracy(design)}. {_gain(design)}{seen}"
+    return Verdict(text, Level.GOOD, ok)
+
+
+def _gain(design: Design) -> str:
+    """Say that a design gains little over its start; empty where it gains more."""
+    if design.is_start:
+        return "It is no better than its start. "
+    sizes = np.where(design.sizes > 0.0, design.sizes, np.inf)
+    first, last = (
+        float(np.max((each.std / sizes)[list(design.wanted)], initial=0.0))
+        for each in (design.initial, design.final)
+    )
+    if not (_is_allowed(design) and 0.0 < first < SMALL_GAIN * last < np.inf):
+        return ""
+    share = format_percent(abs(1.0 - last / first))
+    place = f"only {share} below" if last < first else f"{share} above"
+    return f"Its largest σ is {place} that of its start. "
+
+
+def _is_allowed(design: Design) -> bool:
+    """Whether the start keeps all limits with the reserve."""
+    return design.scaled_start is None and not design.initial_violations
 
 
 def _is_separable(design: Design) -> bool:
@@ -240,6 +265,11 @@ def _observed(rehearsal: Rehearsal) -> Iterator[str]:
         yield f"{speeds}."
     moving = _moving_at_end(rehearsal)
     yield f"It ends in motion: {first_ones(moving)}." if moving else "It ends at rest."
+
+
+def _at_end(rehearsal: Rehearsal) -> str:
+    """What must happen after a motion that does not end at rest."""
+    return "" if rehearsal.at_rest else ", then stop it or let it swing out"
 
 
 def _moving_at_end(rehearsal: Rehearsal) -> list[str]:
@@ -330,7 +360,7 @@ def _reservation_of_robots(rehearsal: Rehearsal) -> str:
 def _tells_less(design: Design) -> bool:
     """Whether a start inside the limits has more information."""
     before, after = _least_eigenvalues(design)
-    return not design.initial_violations and RELEVANT_RATIO * after < before
+    return _is_allowed(design) and RELEVANT_RATIO * after < before
 
 
 def _accuracy(design: Design) -> str:
@@ -346,7 +376,7 @@ def _accuracy(design: Design) -> str:
     sentence += f" with a σ of {relative(after, design.sizes[worst])} or less"
     if not np.isfinite(before):
         return f"{sentence}; the initial motion does not determine {name}"
-    if before > RELEVANT_RATIO * after:
+    if before > SMALL_GAIN * after:
         times = f"{before / after:.3g} times smaller than with the initial motion"
         return f"{sentence} (largest for {name}, {times})"
     return f"{sentence} (largest for {name})"
@@ -450,7 +480,7 @@ def rehearsal_page(rehearsal: Rehearsal) -> Page:
         text = f"This motion can be played, but {reservation}. {seen}"
         verdict = Verdict(text, Level.DOUBTFUL, ok=True)
     else:
-        verdict = Verdict(f"Safe to play. {seen}", Level.GOOD, ok=True)
+        verdict = Verdict(f"Safe to play{_at_end(rehearsal)}. {seen}", Level.GOOD, ok=True)
     control = "with feedback" if rehearsal.feedback else "open loop"
     return Page(
         kind="Rehearsal of a design",
@@ -611,7 +641,8 @@ def _accuracy_parts(design: Design) -> Iterator[Part]:
 
 def _scaled_sentence(design: Design, scaled: ScaledStart) -> str:
     """Compare a design with the initial control, scaled until it keeps all limits."""
-    share = f"The initial control scaled by {scaled.share:.2g} keeps all limits"
+    reserve = " with the reserve" if design.reserve else ""
+    share = f"The initial control scaled by {scaled.share:.2g} keeps all limits{reserve}"
     if not keeps_limits(design):
         return f"{share}; the design does not."
     after = float(design.final.eigenvalues[0])

@@ -47,7 +47,7 @@ MAX_CORRELATIONS = 12
 # Mark of recordings that are part of the last fit, and its meaning.
 FITTED_MARK = " *"
 FITTED_NOTE = (
-    "* predicted by a fit to the other recordings, but part of the last fit; --held-out keeps a "
+    "* predicted by a fit without it, but part of the last fit; --held-out keeps a "
     "recording out of it"
 )
 

@@ -118,7 +118,7 @@ def accuracy_over_time_panel(
     for place, j in enumerate(shown):
         role, goal = f"series{place}", targets[j] / shares[j]
         final = relative(motions[-1][1][-1, j], sizes[j])
-        main = {"width": 2.0, "label": f"{shorten(names[j])} {final}"}
+        main = {"width": 2.0, "label": f"{shorten(names[j], among=names)} {final}"}
         for order, (t, std) in enumerate(motions, start=1):
             percent = std[:, j] / shares[j]
             look = main if order == len(motions) else INITIAL_LOOK

@@ -426,8 +426,11 @@ def _limit_panel(
     """Return the panel of one kind of limit; the curves closest to a bound are strong."""
     closest = sorted(curves, key=lambda usage: -largest_share(usage))
     # Words with their numbers stay in one line.
+    names = [usage.name for usage in curves]
     shares = [
-        f"{shorten(usage.name, 18)} {whole_percent(largest_share(usage))}".replace(" ", "\u00a0")
+        f"{shorten(usage.name, 18, names)} {whole_percent(largest_share(usage))}".replace(
+            " ", "\u00a0"
+        )
         for usage in closest[:NAMED_CURVES]
     ]
     solid = [usage for usage in curves if would_be_solid(usage)]
@@ -437,10 +440,12 @@ def _limit_panel(
     if in_rows:
         shown, draw = [usage for usage in curves if usage in closest[:MAX_ROWS]], _row_marks
         axis = row_axis([usage.name for usage in shown])
+    # Curves without a colour of their own have no entry in the legend.
+    labels = {name: shorten(name, 24, roles) for name in roles}
     marks = [
         each
         for place, usage in enumerate(shown)
-        for each in draw(usage, place, roles.get(usage.name, "muted"))
+        for each in draw(usage, place, roles.get(usage.name, "muted"), labels.get(usage.name, ""))
     ]
     if not in_rows:
         one_sided = curves[0].kind == "clearance"
@@ -458,33 +463,28 @@ def _limit_panel(
     )
 
 
-def _curve_marks(usage: LimitUsage, place: int, role: str) -> list[Mark]:
+def _curve_marks(usage: LimitUsage, place: int, role: str, label: str) -> list[Mark]:
     """Return the curve of one limit, or the envelope of one that changes too fast to be seen."""
     strong, front = place < NAMED_CURVES, 3.0 - 0.01 * place
     if not would_be_solid(usage):
-        look = {"width": 1.4 if strong else 0.7, "front": front, "label": _name(usage, role)}
+        look = {"width": 1.4 if strong else 0.7, "front": front, "label": label}
         return [line(usage.t, 100.0 * usage.share, role, **look)]
     t, low, high = envelope(usage)
     return [
         area(t, low, high, role, opacity=0.25 if strong else 0.08, front=front),
-        line(t, low, role, width=0.9 if strong else 0.4, front=front, label=_name(usage, role)),
+        line(t, low, role, width=0.9 if strong else 0.4, front=front, label=label),
         line(t, high, role, width=0.9 if strong else 0.4, front=front),
     ]
 
 
-def _name(usage: LimitUsage, role: str) -> str:
-    """Return the entry of a limit in the legend; curves without an own colour have none."""
-    return "" if role == "muted" else shorten(usage.name, 24)
-
-
-def _row_marks(usage: LimitUsage, place: int, role: str) -> list[Mark]:
+def _row_marks(usage: LimitUsage, place: int, role: str, label: str) -> list[Mark]:
     """Return a row that is filled up to the largest share of each interval of time."""
     t, low, high = envelope(usage)
     base = place + 0.5 * FULL_ROW
     top = base - FULL_ROW * np.maximum(np.abs(low), np.abs(high)) / 100.0
     return [
         area(t, np.full(len(t), base), top, role, opacity=0.45),
-        line(t, top, role, width=0.9, label=_name(usage, role)),
+        line(t, top, role, width=0.9, label=label),
         hline(base - FULL_ROW, width=0.6),
     ]
 

@@ -135,7 +135,7 @@ def figure_of(picture: Picture) -> Figure:
         )
         # Names beside a wide panel make all columns narrower.
         wide = [name for panel in picture.panels if panel.is_wide for name in panel.y.names or ()]
-        names = (text_width(shorten(name, NAME_WIDTH), SMALL_FONT) for name in wide)
+        names = (text_width(shorten(name, NAME_WIDTH, wide), SMALL_FONT) for name in wide)
         room = WIDTH - max(names, default=0.0)
         for panel in picture.panels:
             row, column = panel.place
@@ -302,7 +302,8 @@ def _set_axis(axes: Axes, axis: DrawnAxis, stated: Axis, room: float, height: fl
 
 def _name_ticks(axis: DrawnAxis, stated: Axis, room: float) -> None:
     """Write names at the ticks of an axis; across, upright where they have no room [inch]."""
-    names = [shorten(name, UPRIGHT_WIDTH if room else NAME_WIDTH) for name in stated.names or ()]
+    every, width = stated.names or (), UPRIGHT_WIDTH if room else NAME_WIDTH
+    names = [shorten(name, width, every) for name in every]
     axis.set_ticklabels(names, fontsize=SMALL_FONT if len(names) <= MANY else TINY_FONT)
     if room:
         widest = max((text_width(name, SMALL_FONT) for name in names), default=0.0)

@@ -380,8 +380,8 @@ def held_out(estimate: Estimate, index: int, labels: Labels) -> Picture:
     recording = prediction.recording
     assert recording is not None
     note = (
-        "Error: measured − predicted. The parameters were fitted to other recordings; of this "
-        "one, only initial states are estimated."
+        "Error: measured − predicted. The parameters were fitted without this recording; of it, "
+        "only initial states are estimated."
     )
     return _over_time(
         recording,
@@ -660,12 +660,12 @@ def predictions(estimate: Estimate, labels: Labels) -> Picture:
         beside=[("", "text", texts)],
     )
     note = (
-        "The identified parameters were fitted to all other recordings; of the predicted "
+        "The identified parameters were fitted without the predicted data; of the predicted "
         "recording only the initial state is estimated. On the right: error of the identified "
         "model, and its ratio to that of the nominal model."
     )
     if not all(prediction.held_out for prediction in shown):
-        note += " *: also part of the last fit; predicted here by a fit to the other recordings."
+        note += " *: also part of the last fit; predicted here by a fit without it."
     if len(shown) < len(found) or len(measured) > MAX_SPECTRA:
         note += (
             f" Shown: {len(shown)} of {len(found)} recordings and "
@@ -686,8 +686,13 @@ def _prediction_name(prediction: Prediction) -> str:
 # ---- residual forces
 
 
-def residual_torque(found: Sequence[ResidualForce]) -> Picture:
-    """Show the force that the model does not explain at each joint, over speed and position."""
+def residual_torque(found: Sequence[ResidualForce], *, is_explained: bool = False) -> Picture:
+    """Show the force that the model does not explain at each joint, over speed and position.
+
+    Args:
+        found: The residual forces.
+        is_explained: Whether the model explains the recordings all the same.
+    """
     order = sorted(found, key=lambda each: -each.noise_ratio)
     shown = [each for each in found if each in order[:MAX_JOINTS]]
     panels = []
@@ -716,6 +721,9 @@ def residual_torque(found: Sequence[ResidualForce]) -> Picture:
         "or backlash. A slope or a wave is a cable, a spring, gravity or cogging. A few distant "
         "points are not drawn."
     )
+    if is_explained:
+        # Smoothed motions lag behind joints that answer faster than they are sampled.
+        note += " Here the model explains the recordings: these are errors of the smoothed motion."
     note += share_note(shown, found, "joints, those with the largest residuals over the noise")
     heights = [1.75] * len(shown)
     return Picture(

@@ -187,7 +187,7 @@ def _estimates_by_length(study: HorizonStudy, j: int, axis: Axis) -> Panel:
             line([length] * 2, [value - half, value + half], role, symbol="_", size=6.0),
             dots([length], [value], role),
         ]
-    label = with_unit(shorten(study.parameters[j], 14), study.units[j])
+    label = with_unit(shorten(study.parameters[j], 14, study.parameters), study.units[j])
     return Panel(marks=marks, x=axis, y=Axis(label=label, most=3))
 
 
@@ -251,7 +251,7 @@ def _recordings_panel(
         marks.append(intervals([begin], [end], [len(rows)], "muted", width=3.0))
     limits = range_of_intervals(value, value - half, value + half)
     roles = [DESIGNED if k in odd else "text" for k in rows]
-    shown = row_axis([shorten(name, 16) for name in names], roles)
+    shown = row_axis([shorten(name, 16, names) for name in names], roles)
     if not is_left:
         shown = blank_rows(len(names))
     label = with_unit(comparison.parameters[j], comparison.units[j])
@@ -505,10 +505,10 @@ def _corner(
             is_lowest, is_left = row == len(shown) - 1, column == 0 and row > 0
             panels.append(
                 Panel(
-                    title=shorten(names[i], 18) if i == j else "",
+                    title=shorten(names[i], 18, names) if i == j else "",
                     marks=single(i) if i == j else pair(j, i),
-                    x=_outer(across, names[j], units[j], is_lowest),
-                    y=_outer(up, names[i], units[i], is_left),
+                    x=_outer(across, shorten(names[j], 14, names), units[j], is_lowest),
+                    y=_outer(up, shorten(names[i], 14, names), units[i], is_left),
                     place=(row, column),
                 )
             )
@@ -526,7 +526,7 @@ def _corner(
 
 def _outer(axis: Axis, name: str, unit: str, is_outer: bool) -> Axis:
     """Return an axis that has words only at the edge of the picture."""
-    label = f"{shorten(name, 14)}\n[{unit}]" if unit else shorten(name, 14)
+    label = f"{name}\n[{unit}]" if unit else name
     return replace(axis, label=label) if is_outer else replace(axis, names=None, hidden=True)
 
 

@@ -231,7 +231,11 @@ def _(estimate: Estimate) -> Pictures:
         "horizons": (estimate.horizons is not None, partial(estimate_studies.horizons, estimate)),
         "residual_torque": (
             bool(estimate.residual_forces),
-            partial(of_estimate.residual_torque, estimate.residual_forces),
+            partial(
+                of_estimate.residual_torque,
+                estimate.residual_forces,
+                is_explained=not estimate.misfit,
+            ),
         ),
         "recordings": (
             estimate.recording_comparison is not None,

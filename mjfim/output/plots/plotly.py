@@ -244,7 +244,7 @@ def _axis(axis: Axis, label: str) -> Plotly:
     if axis.ticks is not None:
         shown |= {"tickmode": "array", "tickvals": [float(tick) for tick in axis.ticks]}
     if axis.names is not None:
-        names = [escape(shorten(name, NAME_WIDTH)) for name in axis.names]
+        names = [escape(shorten(name, NAME_WIDTH, axis.names)) for name in axis.names]
         shown |= {"ticktext": names, "showgrid": False, "zeroline": False, "fixedrange": True}
     return shown
 

@@ -599,7 +599,7 @@ def robots(comparison: RobotComparison) -> Picture:
             intervals(low[chosen], high[chosen], rows[chosen], role, width=1.4),
             dots(centre[inside], rows[inside], role, size=5.5, label=label),
         ]
-    first, second = (shorten(name, 24) for name in comparison.names)
+    first, second = (shorten(name, 24, comparison.names) for name in comparison.names)
     texts = [
         " → ".join(
             format_with_uncertainty(value, NORMAL_95 * std)
@@ -617,7 +617,10 @@ def robots(comparison: RobotComparison) -> Picture:
 
     title = f"{second} and {first}: no difference proven"
     if comparison.changed:
-        names = [shorten(comparison.parameters[j], 26) for j in comparison.changed[:3]]
+        names = [
+            shorten(comparison.parameters[j], 26, comparison.parameters)
+            for j in comparison.changed[:3]
+        ]
         more = len(comparison.changed) - len(names)
         others = f" and {more} more" if more else ""
         title = f"{second} differs from {first} in {', '.join(names)}{others}"
@@ -786,7 +789,7 @@ def campaign(result: Campaign, true: Array | None = None) -> Picture:
     limits = (0.5, float(numbers[-1]) + 0.5)
     panels = []
     for j in shown:
-        name = shorten(result.parameters[j], 18)
+        name = shorten(result.parameters[j], 18, result.parameters)
         unit = result.rounds[0].estimate.units[j]
         label = "round" if j == shown[-1] else ""
         ticks = numbers.tolist() if len(numbers) <= MAX_TICKS else None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -394,8 +395,8 @@ def open_recording(
     time_panel = rrb.TimePanel(
         state="collapsed", timeline="sim_time", play_state="playing", loop_mode="all"
     )
-    # The names of a compiled model begin with that of the model.
-    name = model.names.split(b"\0", 1)[0].decode()
+    # The names of a compiled model begin with that of the model. Rerun warns of other characters.
+    name = re.sub(r"[^\w -]", "-", model.names.split(b"\0", 1)[0].decode(), flags=re.ASCII)
     with (
         replacing(path) as partial,
         rr.RecordingStream(f"mjfim {kind} {name}".strip()) as rec,
