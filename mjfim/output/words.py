@@ -137,10 +137,12 @@ def shorten(text: str, width: int = 28, among: Iterable[str] = ()) -> str:
         among: Names beside it.
     """
     names = [text, *({*among} - {text})]
-    for kept in range(width - 1, MOST_WIDTHS * width):
+    for kept in range(2 * ((width - 1) // 2), MOST_WIDTHS * width):
         for head in sorted(range(1, kept), key=lambda head: abs(2 * head - kept)):
             short, *others = (
-                name if len(name) <= kept + 1 else f"{name[:head]}…{name[head - kept :]}"
+                name
+                if len(name) <= max(width, kept + 1)
+                else f"{name[:head]}…{name[head - kept :]}"
                 for name in names
             )
             if short not in others:

@@ -282,7 +282,7 @@ def test_what_nothing_limits_and_every_end_in_motion_is_said() -> None:
 
 def test_shortened_names_stay_different() -> None:
     short = shorten("armature_joint_0_and_2_more", 18, ["armature_joint_3_and_2_more"])
-    assert short == "armat…0_and_2_more"
+    assert short == "arma…0_and_2_more"
 
 
 REPEATED = tuple(replace(row, repetitions=4) for row in results.check().rows)
