@@ -175,6 +175,11 @@ def test_friction_moves_as_its_equation_says(
     without = simulated(system, ctrl, system.parameters.guess)
     assert np.abs(without - expected)[:, 0].max() > 0.1 * np.ptp(expected[:, 0])
 
+    # Impacts of the ball would have derivatives of 1e4 and more.
+    motion = system.plant.simulate(system.parameters.true, ctrl)
+    linear = system.plant.derivatives.linearize(system.parameters.true, motion)
+    assert np.abs(np.linalg.eigvals(linear.A)).max() < 1.5
+
 
 def test_friction_of_the_load_needs_direct_drives_only(tmp_path: Path) -> None:
     """The friction would contain the feedback of a servo beside the motor."""

@@ -53,12 +53,6 @@ def test_a_wrong_form_is_refused_with_the_right_ones(text: str, message: str) ->
         StatedExecutor.parse(text)
 
 
-def test_local_processes_are_counted() -> None:
-    assert StatedExecutor.parse("local").processes is None
-    assert StatedExecutor.parse("local:3").processes == 3
-    assert StatedExecutor.parse("dask://host:8786").processes is None
-
-
 @pytest.fixture
 def factory(tmp_path: Path) -> Path:
     """A file with functions that make executors."""

@@ -153,10 +153,6 @@ def test_remarks(of_both: dict[str, Any], of_second: dict[str, Any], said: str) 
     assert found.is_reliable is not is_poor
 
 
-def test_robots_without_a_remark() -> None:
-    assert compare_estimates(estimate(), estimate(1)).remarks == ()
-
-
 def test_known_combinations_are_compared_by_the_honest_covariance() -> None:
     """Noise five times as large as stated, of which single parameters hardly show anything."""
     sums, differences = np.array([1.0, 1.0, 0.0]), np.array([1.0, -1.0, 0.0])
