@@ -1,9 +1,9 @@
 """Levenberg-Marquardt inside bounds, and undamped Gauss-Newton, on condensed least squares.
 
 Gauss-Newton is the method of the paper. The damping of Levenberg-Marquardt follows the ratio of the
-actual to the predicted decrease of the cost (Nielsen 1999). Bounds hold in every step, because each
-step is the solution of a bounded linear least-squares problem. The module knows arrays and one
-protocol, not MuJoCo.
+actual to the predicted decrease of the cost (Nielsen 1999). Where damped steps gain little, a part
+of the step without damping is tried. Bounds hold in every step, because each step is the solution
+of a bounded linear least-squares problem. The module knows arrays and one protocol, not MuJoCo.
 """
 
 from __future__ import annotations
@@ -161,6 +161,13 @@ COMPLETE_STEP = 1.1
 # factor by which it is.
 MIN_RATIO_TO_LENGTHEN = 1.2
 MAX_LENGTHENING = 3.0
+
+# Largest part of a step without damping that is tried, and a limit below which none is.
+FIRST_PART = 0.25
+LAST_PART = 0.05
+
+# Share of what a part promises. A part is tried where the damped step gains less than this share.
+SMALL_SHARE = 0.5
 
 # Decrease of the cost, relative to the cost, below which a search is near enough to its minimum for
 # its residuals to show how much they are autocorrelated.
@@ -436,6 +443,7 @@ class _Search:
         # The search ends where the cost no longer falls, even if the linearisation predicts a
         # decrease.
         predicted = self._predicted_step()
+        trial = self._bolder(trial, predicted)
         if self._stagnates(trial, predicted):
             self.unknowns = trial.unknowns
             self.cost = trial.cost
@@ -447,11 +455,11 @@ class _Search:
         if self.settings.lengthens and not (converged or futile or near):
             trial = self._lengthened(trial)
         slow = self._is_slow(trial)
-        self.previous_length = trial.step.common_length
+        self.previous_length = trial.fraction * trial.step.common_length
         self.unknowns = trial.unknowns
         self.cost = trial.cost
         if self.callback is not None:
-            self.callback(self.iteration, self.cost, trial.fraction * trial.step.common_length)
+            self.callback(self.iteration, self.cost, self.previous_length)
 
         if converged:
             # The last step is linearised at its end where the settings ask for it.
@@ -506,6 +514,28 @@ class _Search:
             return trial
         return replace(trial, unknowns=further, cost=cost, fraction=fraction)
 
+    def _bolder(self, trial: _Trial, predicted: Step) -> _Trial:
+        """A part of the step without damping, if the cost falls further there; else the trial.
+
+        Damping shortens steps most along combinations that the data determine little, such as the
+        common scale of gains, friction and inertia. Where residuals are rough in other directions,
+        the damping stays large, and such a search would creep.
+
+        Args:
+            trial: The accepted step from the present unknowns.
+            predicted: The step without damping.
+        """
+        fraction = FIRST_PART if self.damping > INITIAL_DAMPING else 0.0
+        while fraction > LAST_PART and self.budget.exhausted is None:
+            expected = SMALL_SHARE * fraction * predicted.predicted_decrease
+            if self.cost - trial.cost >= expected:
+                break
+            part = self._trial(predicted, fraction)
+            if part.cost < trial.cost:
+                return part
+            fraction *= 0.5
+        return trial
+
     def _accepted_trial(self) -> _Trial | Solution:
         """Raise the damping until a step lowers the cost.
 
@@ -531,13 +561,11 @@ class _Search:
             if (stopped := self._stopped()) is not None:
                 return stopped
 
-    def _trial(self, step: Step) -> _Trial:
-        """Evaluate a step with the current damping.
+    def _trial(self, step: Step, fraction: float = 1.0) -> _Trial:
+        """Evaluate a fraction of a step.
 
         Without damping, the step is halved while it raises the cost.
         """
-        fraction = 1.0
-
         while True:
             unknowns = self.problem.moved(self.unknowns, step, fraction)
             cost = self.problem.cost(unknowns)
@@ -547,7 +575,8 @@ class _Search:
                 break
             fraction *= 0.5
 
-        ratio = (self.cost - cost) / max(step.predicted_decrease, SMALLEST_DECREASE)
+        expected = fraction * (2.0 - fraction) * step.predicted_decrease
+        ratio = (self.cost - cost) / max(expected, SMALLEST_DECREASE)
         return _Trial(
             step=step,
             unknowns=unknowns,

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -331,20 +332,24 @@ def test_a_search_from_the_minimum_ends_at_once() -> None:
     assert again.success and again.iterations <= 2
 
 
-def test_short_first_steps_in_a_flat_valley_are_not_convergence() -> None:
-    """The first steps on the floor of a narrow valley are short.
+def test_a_search_follows_a_flat_valley_to_its_end() -> None:
+    """The first steps on the floor of a narrow valley are short, which is no convergence.
 
-    The minimum is ten standard deviations away.
+    The minimum is ten standard deviations away. Kinks, of which the best costs 900, do not stop it.
     """
+
+    def rows(theta: Array, private: Array, thin: float = 0.1) -> Array:
+        return theta @ [[1.0, thin], [1.0, -thin]] - [2.0, 10.0]
+
+    def kinked(theta: Array, private: Array) -> Array:
+        r = rows(theta, private)
+        return r * np.sign(np.real(r)) + 30.0
+
     for thin in (1e-2, 1e-3, 1e-4, 1e-5):
-
-        def rows(theta: Array, private: Array, thin: float = thin) -> Array:
-            total, apart = theta[0] + theta[1], theta[0] - theta[1]
-            return np.array([total - 2.0, thin * apart - 10.0])
-
-        found = solved(Analytic(rows), alone(1.0, 1.0), SearchSettings())
+        found = solved(Analytic(partial(rows, thin=thin)), alone(1.0, 1.0), SearchSettings())
         assert found.success, found.status
-        assert_allclose(thin * (found.unknowns.theta @ [1.0, -1.0]), 10.0, rtol=0, atol=0.02)
+        assert found.cost < 2e-4
+    assert solved(Analytic(kinked), alone(0.0, 0.0)).cost < 1000.0
 
 
 @pytest.mark.parametrize("stop", [1, 2, 3, 7])
@@ -477,8 +482,7 @@ def test_longer_steps_reach_the_minimum_of_a_robust_loss_sooner() -> None:
     )
     assert sooner.success
     assert len(longer.linearised) < 0.75 * len(plain.linearised)
-    sharp = {"xtol": 1e-14, "ftol": 1e-14, "gtol": 1e-14}
-    expected = least_squares(lambda theta: A @ theta - y, start.theta, loss="soft_l1", **sharp).x
+    expected = least_squares(lambda theta: A @ theta - y, start.theta, loss="soft_l1").x
     assert_allclose(sooner.unknowns.theta, expected, rtol=0.0, atol=1e-4)
     assert sooner.cost == longer.cost(sooner.unknowns) == costs[-1]
     assert (np.diff(costs) < 0.0).all()
