@@ -180,8 +180,12 @@ def _matches(
     return max(found, key=lambda each: each[:2], default=(0, False, {}))[2]
 
 
-def _servos(channels: Channels) -> Iterator[tuple[str, str]]:
-    """Columns of the references of position servos, each with the column of its joint."""
+def references(channels: Channels) -> Iterator[tuple[str, str]]:
+    """Columns of the references of laws and servos, each with the column of its joint."""
+    if channels.laws is not None:
+        for law in channels.laws.laws:
+            yield channels.control_columns[law.columns["reference"]], f"qpos:{law.joint}"
+        return
     for i, name in enumerate(channels.control_columns):
         joint = commanded_joint(channels.model, i)
         if joint is not None:
@@ -200,7 +204,7 @@ def _units(
             units[name] = "deg/s" if name.startswith("qvel:") else "deg"
             values[name] = np.radians(values[name])
     # The references of a servo have the unit of its joint.
-    units |= {name: units[at] for name, at in _servos(channels) if name in found and at in units}
+    units |= {name: units[at] for name, at in references(channels) if name in found and at in units}
     return {name: unit for name, unit in units.items() if not table.unit(found[name][0])}
 
 

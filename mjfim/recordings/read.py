@@ -44,7 +44,7 @@ from mjfim.recordings.checks import (
     in_order,
 )
 from mjfim.recordings.formats import Table, is_lerobot_dataset, lerobot_episodes, read_columns
-from mjfim.recordings.proposal import proposed_recording, sensors_of_joints
+from mjfim.recordings.proposal import proposed_recording, references, sensors_of_joints
 from mjfim.recordings.quantities import TURN, Unit
 from mjfim.recordings.section import INPUT_PREFIXES, LAW_PREFIXES, ColumnSpec, RecordingSpec
 from mjfim.records.base import Record
@@ -202,10 +202,9 @@ def log_of(table: Table, channels: Channels) -> tuple[Recording, LogSummary]:
     # The recording begins at time 0.
     t = stamps[rows] - stamps[numbers[0]]
     resting = set()
-    for law in channels.laws.laws if channels.laws is not None else ():
-        reference = channels.control_columns[law.columns["reference"]]
-        if reference in columns and np.nanmin(columns[reference]) == np.nanmax(columns[reference]):
-            resting |= {f"qpos:{law.joint}", f"qvel:{law.joint}"}
+    for name, position in references(channels):
+        if name in columns and np.nanmin(columns[name]) == np.nanmax(columns[name]):
+            resting |= {position, position.replace("qpos:", "qvel:", 1)}
     for name in measured:
         where = f"{path}: column {sources[name].column!r}"
         check_measured(where, t, columns[name], spec.gap, may_rest=name in resting)

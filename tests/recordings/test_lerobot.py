@@ -152,11 +152,15 @@ def test_names_have_many_forms(stated: Any, columns: list[str], tmp_path: Path) 
 
 
 def test_degrees_are_refused_with_the_way_to_state_units(tmp_path: Path) -> None:
-    """A joint with a range whose positions are in degrees; then commands without a unit."""
+    """A joint with a range whose positions are in degrees; then commands without a unit.
+
+    The last joint rests, as its reference does.
+    """
     stated = mjfim.Experiment.from_file(MODELS / "servo_arm.toml")
     model = System.resolve(stated).model
     joints = [model.joint(i).name for i in range(model.njnt)]
-    angles = np.rad2deg(0.8 + 0.3 * np.sin(0.05 * np.arange(100)[:, None] + np.arange(4)))
+    waves = np.sin(0.05 * np.arange(100)[:, None] + np.arange(4)) * [0.3, 0.3, 0.3, 0.0]
+    angles = np.rad2deg(0.8 + waves)
     features = {"action": angles, "observation.state": angles}
     names = [f"{joint}.pos" for joint in joints]
     folder = write_dataset(tmp_path / "set", [features], dict.fromkeys(features, names))

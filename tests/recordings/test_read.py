@@ -263,14 +263,17 @@ def hole(values: Array, begin: int, end: int) -> Array:
 def test_a_joint_may_rest_where_its_reference_rests(tmp_path: Path) -> None:
     """Its encoder shows one number then; where the reference moves, the channel is dead."""
     system = System.resolve(arm_experiment({"shoulder": {"kp": 60.0, "kd": 4.0}}))
-    columns = {"t": np.arange(M) / 500.0, "ctrl:elbow": wave()}
-    columns |= {"reference:shoulder": np.full(M, 0.3), "qpos:shoulder": np.full(M, 0.29)}
+    columns = {
+        "t": np.arange(M) / 500.0,
+        "ctrl:elbow": wave(),
+        "reference:shoulder": np.full(M, 0.3),
+        "qpos:shoulder": np.full(M, 0.29),
+    }
     log = tmp_path / "log.csv"
 
     def written() -> Array:
-        """Write the columns, and read them."""
-        rows, header = np.column_stack([*columns.values()]), ",".join(columns)
-        np.savetxt(log, rows, "%.9g", ",", header=header, comments="")
+        rows = np.transpose([*columns.values()])
+        np.savetxt(log, rows, "%.9g", ",", header=",".join(columns), comments="")
         return read_recording(log, system.channels).y
 
     assert np.ptp(written()) == 0.0
