@@ -785,7 +785,7 @@ class _RobotPlayer:
 
 
 def _speed_groups(task: DesignTask) -> Iterator[_SpeedGroup]:
-    """The joints of a model: a free joint has a speed and an angular speed."""
+    """The joints of a model but those of terms: a free joint has a speed and an angular speed."""
     model = task.system.model
     limited = {limit.kind: set[str]() for limit in task.limits}
     for limit in task.limits:
@@ -800,6 +800,8 @@ def _speed_groups(task: DesignTask) -> Iterator[_SpeedGroup]:
     }
 
     for joint, name in enumerate(joint_names(model)):
+        if int(model.jnt_qposadr[joint]) in task.system.source.added:
+            continue
         first, count = int(model.jnt_dofadr[joint]), joint_dofs(model, joint)
         kinds: tuple[str, ...] = ("velocity", "angular_velocity")
         is_placed = not placed.isdisjoint({("position", name), ("tilt", name)})

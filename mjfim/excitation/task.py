@@ -152,7 +152,8 @@ class DesignTask:
     ) -> DesignTask:
         """Put a task together; `weighted`: weights or limits have to bound every control."""
         experiment, names = system.experiment, system.controls
-        limits = limits_of(system.model, names, experiment.limits, system.grid.dt)
+        of_terms = system.source.added
+        limits = limits_of(system.model, names, experiment.limits, system.grid.dt, of_terms)
 
         weight = by_name("cost.control", experiment.cost.control, names, "actuator")
         if weighted:

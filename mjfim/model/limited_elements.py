@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import field, replace
 from typing import Any, Literal
 
@@ -78,8 +78,8 @@ class LimitedElement:
         unit: Unit of the quantity; empty where the model does not determine it.
         size: Natural size of the quantity [unit of the kind].
         stated: Range of the MJCF, or None.
-        is_part: True for one coordinate of a ball or free joint and for one force of an actuator.
-            A number without a table does not hold for it.
+        is_part: True for one coordinate of a ball or free joint, for one force of an actuator and
+            for joints of physical terms. A number without a table does not hold for it.
     """
 
     index: int
@@ -113,13 +113,16 @@ class LimitedElements:
         )
 
 
-def limited_elements(model: Any, controls: tuple[str, ...], period: float) -> LimitedElements:
+def limited_elements(
+    model: Any, controls: tuple[str, ...], period: float, added: Collection[int] = ()
+) -> LimitedElements:
     """Look up all elements of a model that can have limits.
 
     Args:
         model: MjModel.
         controls: Names of its nu controls.
         period: Sample period, from which the natural sizes of rates follow [s].
+        added: Addresses in qpos of joints that physical terms have added.
     """
     words = [JOINT_WORDS[kind] for kind in model.jnt_type.tolist()]
     names = joint_names(model)
@@ -129,7 +132,8 @@ def limited_elements(model: Any, controls: tuple[str, ...], period: float) -> Li
     sizes = position_sizes(model)
     forces = force_sizes(model, time)
     for joint, name in enumerate(names):
-        _add_joint(found, model, joint, name, sizes, time)
+        is_part = int(model.jnt_qposadr[joint]) in added
+        _add_joint(found, model, joint, name, sizes, time, is_part=is_part)
         if model.jnt_type[joint] not in (BALL, FREE):
             dof = int(model.jnt_dofadr[joint])
             found.by_kind["joint_force"][name] = LimitedElement(
@@ -137,6 +141,7 @@ def limited_elements(model: Any, controls: tuple[str, ...], period: float) -> Li
                 unit=FORCE_UNITS[joint_unit(model, joint)],
                 size=float(forces[dof]),
                 stated=_range(model.jnt_actfrclimited, model.jnt_actfrcrange, joint),
+                is_part=is_part,
             )
 
     widths = control_sizes(model, time)
@@ -166,7 +171,14 @@ def actuators_of_tendons(model: Any) -> list[tuple[int, ...]]:
 
 
 def _add_joint(
-    found: LimitedElements, model: Any, joint: int, name: str, sizes: Array, time: float
+    found: LimitedElements,
+    model: Any,
+    joint: int,
+    name: str,
+    sizes: Array,
+    time: float,
+    *,
+    is_part: bool,
 ) -> None:
     """Enter the motion of one joint.
 
@@ -177,6 +189,7 @@ def _add_joint(
         name: Its name.
         sizes: (nv,) natural sizes of the degrees of freedom [m or rad].
         time: Natural time of a motion [s].
+        is_part: Whether a physical term has added it.
     """
     kinds = found.by_kind
     kind = model.jnt_type[joint]
@@ -192,9 +205,10 @@ def _add_joint(
     unit = joint_unit(model, joint)
     rate = per_second(unit)
     # The velocity of a free joint is that of its translation.
-    speed = LimitedElement(index=v, count=count, unit=rate, size=size / time)
+    whole = LimitedElement(index=q, count=count, unit=unit, size=size, is_part=is_part)
+    speed = replace(whole, index=v, unit=rate, size=size / time)
     motion = {
-        "position": LimitedElement(index=q, count=count, unit=unit, size=size, stated=stated),
+        "position": replace(whole, stated=stated),
         "velocity": speed,
         "acceleration": replace(speed, unit=f"{rate}²", size=size / time**2),
     }

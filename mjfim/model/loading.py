@@ -250,11 +250,15 @@ class ModelSource:
         contents = {file.resolve(): each for file, each in self.stated.contents.items()}
         return contents.get(path.resolve()) or path.read_bytes()
 
+    @property
+    def added(self) -> frozenset[int]:
+        """Addresses in the state (qpos, qvel) that physical terms have added."""
+        return frozenset() if self.layout is None else self.layout.added
+
     @cached_property
     def coordinates(self) -> ModelCoordinates:
         """The coordinates of the model by name."""
-        added = () if self.layout is None else self.layout.added
-        return ModelCoordinates.of(self.model, added)
+        return ModelCoordinates.of(self.model, self.added)
 
     @cached_property
     def decoration(self) -> frozenset[str]:

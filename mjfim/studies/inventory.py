@@ -189,7 +189,9 @@ def stated_experiment(experiment: Experiment) -> StatedExperiment:
 
     # A file for recordings alone needs no task of a design.
     if missing or system.laws is not None:
-        limits = limits_of(system.model, system.controls, experiment.limits, system.dt)
+        limits = limits_of(
+            system.model, system.controls, experiment.limits, system.dt, system.source.added
+        )
     else:
         limits = DesignTask.of(system).limits
 

@@ -12,8 +12,10 @@ import scipy
 from numpy.testing import assert_allclose, assert_array_equal
 
 from mjfim.errors import ExperimentError
+from mjfim.excitation.limits.limits import limits_of
 from mjfim.experiment.system import System
 from mjfim.experiment.system_tables import TermKind
+from mjfim.experiment.task_tables import Limits
 from mjfim.model.terms.library import KINDS
 from mjfim.output.export.mjcf import write_identified
 from tests.support.specs import arrays_of
@@ -232,6 +234,8 @@ def test_a_keyframe_of_the_file_gets_the_new_joint(tmp_path: Path) -> None:
     source = system.source
     assert_array_equal(source.model.key_qpos, [[0.5, 0.0]])
     assert_array_equal(source.stated.model.key_qpos, [[0.5]])
+    (limit,) = limits_of(source.model, system.controls, Limits(velocity=1.0), 0.01, source.added)
+    assert limit.name == "pivot"
 
     # Stated positions may leave out the joint that the term adds.
     for qpos in ([0.7], [0.7, 0.0]):

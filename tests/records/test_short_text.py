@@ -54,11 +54,6 @@ def test_a_small_array_shows_its_numbers(array: Any, text: str) -> None:
     assert f"  array={text}" in repr(Thing(table={}, array=np.array(array))).splitlines()
 
 
-def test_only_public_names_are_listed() -> None:
-    listed = dir(mjfim)
-    assert {name for name in listed if not name.startswith("__")} == set(mjfim.__all__)
-
-
 def test_an_experiment_shows_what_is_stated() -> None:
     values = {"model": "arm.xml", "rate": 50.0, "parameters": {"a": "joint/a:damping"}}
     shown = "parameters={'a': ParameterSpec(target='joint/a:damping')}"

@@ -5,7 +5,7 @@ They narrow the ranges of the initial state within which a design chooses a rele
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import field, replace
 from typing import Any
 
@@ -115,7 +115,11 @@ class Limit:
 
 
 def limits_of(
-    model: Any, controls: tuple[str, ...], stated: Limits, period: float
+    model: Any,
+    controls: tuple[str, ...],
+    stated: Limits,
+    period: float,
+    added: Collection[int] = (),
 ) -> tuple[Limit, ...]:
     """Collect all limits, ordered by kind.
 
@@ -124,6 +128,8 @@ def limits_of(
         controls: Names of its nu controls.
         stated: The `[limits]` table of the experiment file.
         period: Sample period, from which the natural sizes of rates follow [s].
+        added: Addresses in qpos of joints that physical terms have added; one number for all joints
+            does not hold for them.
 
     Returns:
         The limits; where MJCF and file both have a range, the intersection of the two.
@@ -132,7 +138,7 @@ def limits_of(
         ExperimentError: A name is unknown, a range is inverted, a stated range excludes that of the
             MJCF, a joint cannot have a stated limit, or a stated limit applies to nothing.
     """
-    found = limited_elements(model, controls, period)
+    found = limited_elements(model, controls, period, added)
     return tuple(
         limit for kind in KINDS for limit in _limits_of_kind(kind, getattr(stated, kind), found)
     )
