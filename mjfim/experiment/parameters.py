@@ -244,7 +244,10 @@ def _nuisance(
     period: Sample period of the experiment [s].
     """
     stated, coordinates = experiment.nuisance, source.coordinates
-    paths = {c.name: c.path for c in coordinates.deviations if c.path}
+    # A contact holds its joint, so that no deviation of it stays.
+    held = {joint for term in source.terms.values() for joint in term.held_joints}
+    deviations = [c for c in coordinates.deviations if c.name.partition(":")[2] not in held]
+    paths = {c.name: c.path for c in deviations if c.path}
     units = {c.name: c.unit for c in coordinates.deviations}
     unnamed = coordinates.unnamed_joints
     if unnamed and stated.initial is not None and not isinstance(stated.initial, Mapping):

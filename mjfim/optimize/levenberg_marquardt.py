@@ -497,7 +497,7 @@ class _Search:
 
         The decrease that a step without damping and bounds predicts is half of what its slope
         alone promises. A parabola with this slope through both costs has its minimum at
-        `1 / (2 - ratio)` of the step.
+        `1 / (2 - ratio)` of the step; this is a little less than it is for a part of a step.
 
         Args:
             trial: The accepted step from the present unknowns.
@@ -531,6 +531,7 @@ class _Search:
             if self.cost - trial.cost >= expected:
                 break
             part = self._trial(predicted, fraction)
+            # Its own ratio decides on the damping: what is rough stays damped.
             if part.cost < trial.cost:
                 return part
             fraction *= 0.5

@@ -136,6 +136,8 @@ def shorten(text: str, width: int = 28, among: Iterable[str] = ()) -> str:
         width: Largest number of characters, where this tells the names apart.
         among: Names beside it.
     """
+    if len(text) <= width:
+        return text
     names = [text, *({*among} - {text})]
     for kept in range(2 * ((width - 1) // 2), MOST_WIDTHS * width):
         for head in sorted(range(1, kept), key=lambda head: abs(2 * head - kept)):

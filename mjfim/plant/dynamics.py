@@ -117,13 +117,13 @@ class Dynamics:
             else ClosedLoopSimulator(source.model, laws, **stepped)
         )
         self.space = self.simulator.space
-        # Differences along a coordinate that contacts hold would be those of its impacts. The rest
-        # of the state determines it within some engine steps.
-        self.is_free = np.ones(self.space.nx)
+        # (nx,) 0 for coordinates that contacts hold, else 1. Differences along them would be those
+        # of impacts. The rest of the state determines them within some engine steps.
+        self.moves_freely = np.ones(self.space.nx)
         for term in source.source.terms.values():
             for joint in term.held_joints:
                 dof = int(source.model.joint(joint).dofadr[0])
-                self.is_free[[dof, self.space.nv + dof]] = 0.0
+                self.moves_freely[[dof, self.space.nv + dof]] = 0.0
         self.nominal_initial_state = np.array(nominal_initial_state, dtype=np.float64)
         self.initial_state_derivative = parameters.initial_state_derivative(self.space.nx)
         self.calibration = Calibration(

@@ -520,7 +520,7 @@ class FirstDerivatives:
         plant, nx = self.plant, self.plant.space.nx
         backward = -np.diag(steps) if central else np.zeros((1, len(steps)))
         moves = np.concatenate([np.diag(steps), backward])
-        moves[:, :nx] *= plant.is_free
+        moves[:, :nx] *= plant.moves_freely
         moved_states = plant.space.plus(states[None], moves[:, None, :nx])
         moved_ctrl = ctrl[None] + moves[:, None, nx:]
         return MovedSamples(

@@ -87,7 +87,7 @@ class MixedDerivatives(FirstDerivatives):
     @property
     def quickest_accuracy(self) -> DifferenceAccuracy:
         """The quickest differences for mixed second derivatives of this plant."""
-        jumps = self.plant.smooth.source.smoothing_speeds or not self.plant.is_free.all()
+        jumps = self.plant.smooth.source.smoothing_speeds or not self.plant.moves_freely.all()
         return SHARED_ORIGIN_SHORT if jumps else SHARED_ORIGIN
 
     def bilinear(
@@ -149,7 +149,7 @@ class MixedDerivatives(FirstDerivatives):
 
         F_mixed, of_sensors = [], []
         for number, w in enumerate(directions):
-            along = (psi @ w) * plant.is_free
+            along = (psi @ w) * plant.moves_freely
             epsilon = self.direction_step(accuracy.direction_step, along / sizes[: space.nx], w)
             distances = np.array([epsilon] if has_origin else [epsilon, -epsilon])
             at = theta + distances[:, None] * w

@@ -185,11 +185,10 @@ def references(channels: Channels) -> Iterator[tuple[str, str]]:
     if channels.laws is not None:
         for law in channels.laws.laws:
             yield channels.control_columns[law.columns["reference"]], f"qpos:{law.joint}"
-        return
-    for i, name in enumerate(channels.control_columns):
+    for i, name in enumerate(channels.controls):
         joint = commanded_joint(channels.model, i)
-        if joint is not None:
-            yield name, f"qpos:{joint_names(channels.model)[joint]}"
+        if joint is not None and f"ctrl:{name}" in channels.control_columns:
+            yield f"ctrl:{name}", f"qpos:{joint_names(channels.model)[joint]}"
 
 
 def _units(

@@ -547,8 +547,8 @@ class Design(ParameterResult):
         start = self.scaled_start
         if start is not None:
             # What keeps them, with the reserve, is the scaled initial control.
-            before = [start.cost, start.min_eigenvalue**-0.5]
-            after = [self.final.cost, float(self.final.eigenvalues[0]) ** -0.5]
+            before = [start.cost, start.min_eigenvalue**0.5]
+            after = [self.final.cost, float(self.final.eigenvalues[0]) ** 0.5]
             return np.allclose(before, after, rtol=TIE_TOLERANCE, atol=0.0)
         if self.initial_violations:
             return False

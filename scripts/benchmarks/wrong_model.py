@@ -66,9 +66,6 @@ PEAKS = (0.2, 1.0)
 # Engine steps of the robot in one engine step of the model.
 FINER = 4
 
-# Stiffness of the flanks of its gears over that of the model.
-STIFFER = (FINER / 3.0) ** 2
-
 # Impedance with which the dry friction of the robot hardly creeps.
 IMPEDANCE = (0.99, 0.99)
 
@@ -179,13 +176,14 @@ def true_robot(
         f"{joint}_backlash": {"kind": "backlash", "joint": joint, "encoder": robot.encoder}
         for joint in robot.gap
     }
-    # The shorter steps of the robot follow stiffer flanks than those of the model.
+    # The default flanks are as stiff as the time steps of the model resolve. Such elasticity would
+    # cause more error than the gap. The shorter steps of the robot resolve stiffer ones.
     resolved = System.resolve(experiment.replace(terms=gaps)).source.terms
     for name, gap in zip(gaps, robot.gap.values(), strict=True):
         gaps[name]["values"] = {
             "gap": share * gap,
-            "compliance": resolved[name].value("compliance") / STIFFER,
-            "damping": resolved[name].value("damping") * STIFFER**0.5,
+            "compliance": resolved[name].value("compliance") / FINER**2,
+            "damping": resolved[name].value("damping") * FINER,
         }
     system = System.resolve(experiment.replace(terms=gaps), threads=1)
     guess = system.parameters.guess

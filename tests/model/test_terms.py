@@ -175,12 +175,17 @@ def test_friction_moves_as_its_equation_says(
     expected = integrated(lambda x, u: EQUATIONS[kind](x, u, values), ctrl, 0.01, [0.0] * 3)[:, :2]
     assert_near(simulated(system, ctrl), expected, 0.005)
     without = simulated(system, ctrl, system.parameters.guess)
-    assert np.abs(without - expected)[:, 0].max() > 0.1 * np.ptp(expected[:, 0])
+    assert np.abs(without - expected).max() > 0.1 * np.ptp(expected)
 
-    # Impacts of the ball would have derivatives of 1e4 and more.
-    motion = system.plant.simulate(system.parameters.true, ctrl)
-    linear = system.plant.derivatives.linearize(system.parameters.true, motion)
-    assert np.abs(np.linalg.eigvals(linear.A)).max() < 1.5
+    # Impacts of the ball would have derivatives of 1e4. Some Euler steps show a part of them.
+    true = system.parameters.true
+    motion = system.plant.simulate(true, ctrl)
+    linear = system.plant.derivatives.linearize(true, motion)
+    dx = np.zeros(system.plant.space.nx)
+    for A, B, u in zip(linear.A, linear.B, ctrl, strict=True):
+        dx = A @ dx + B @ u
+    change = (simulated(system, 1.01 * ctrl)[-1, 0] - motion.qpos[-1, 0]) / 0.01
+    assert dx[0] == pytest.approx(change, rel=0.15 if integrator == "RK4" else 1.0)
 
 
 def test_friction_of_the_load_needs_direct_drives_only(tmp_path: Path) -> None:

@@ -269,7 +269,7 @@ def test_what_nothing_limits_and_every_end_in_motion_is_said() -> None:
         unplaced=joints,
     )
     text = page_of(rehearsal).verdict.sentence
-    assert text.startswith("Safe to play, then stop it or let it swing out.")
+    assert text.startswith("Safe to play, then stop it.")
     assert text.endswith(
         "3 positions have no limit, up to 2.1 rad (hinge) and 0.8 m (cart) from the start. "
         "1 speed has no limit, up to 3 rad/s (hinge). "

@@ -259,11 +259,6 @@ class TestVideo:
             assert frames * picture.info["duration"] == pytest.approx(3000.0, rel=0.1)
 
 
-def test_a_video_is_not_printed_as_bytes() -> None:
-    video = Video(data=b"frames", media_type="image/gif", caption="slow", width=2, height=2)
-    assert "frames" not in repr(video) and "caption='slow'" in repr(video)
-
-
 def test_a_motion_of_another_model_is_no_video(tmp_path: Path) -> None:
     other = mjfim.Experiment.from_file(MODELS / "double_pendulum.toml")
     motion = DesignTask.resolve(cart_pendulum(horizon=0.5)).initial

@@ -8,7 +8,6 @@ import dataclasses
 import io
 import itertools
 import json
-import shutil
 import zipfile
 from dataclasses import replace
 from enum import Enum
@@ -257,9 +256,3 @@ def test_headers_that_announce_too_much(tmp_path: Path) -> None:
         archive.writestr("t.npy", stream.getvalue())
     with pytest.raises(RecordingError, match=r"design\.npz: not a design archive"):
         Design.load(tmp_path)
-
-
-def test_records_may_be_moved(saved: Path, tmp_path: Path) -> None:
-    """The npz file alone is enough, under any name."""
-    shutil.copy(saved / "design.npz", tmp_path / "best.npz")
-    assert_same(Design.load(tmp_path / "best.npz"), results.design())

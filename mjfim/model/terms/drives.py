@@ -74,8 +74,11 @@ KRAUSE_2013 = (
 )
 MUJOCO_DCMOTOR = "MuJoCo DC Motor Model, technical note of MuJoCo 4.0"
 
-# Natural frequency of the motor against the link, times the timestep, at the smallest compliance
-# that a fit may try.
+# Natural frequency of the motor against the link, times the timestep, where no compliance is
+# stated. An explicit step follows it to a per cent.
+STIFFEST = 0.3
+
+# The same at the smallest compliance that a fit may try.
 STIFFEST_OF_FIT = 1.0
 
 # Inertia of the rotor over that of the joint, where the model states no armature.
@@ -241,8 +244,6 @@ class JointElasticity(Term):
 
     Attributes:
         damping_ratio: Damping ratio of the motor against the link where no damping is stated.
-        stiffest: Natural frequency of the motor against the link, times the timestep, where no
-            compliance is stated.
         spring: Kind and name of the element that is the spring, as in a parameter path, with `{}`
             for the name of the term.
         joint: Name of the joint that becomes motor and link.
@@ -283,8 +284,6 @@ class JointElasticity(Term):
     # MuJoCo keeps the stiffness, the inverse of the compliance.
     is_written_as_a_whole = True
     damping_ratio = 0.1
-    # An explicit step follows this frequency to a per cent.
-    stiffest = 0.3
     spring = "joint/{}"
 
     joint: str
@@ -342,8 +341,8 @@ class JointElasticity(Term):
         cls, at: JointSizes, table: TermTable, model: Any, reduced: float
     ) -> dict[str, TermQuantity]:
         """Fields where the table states nothing. reduced: inertia of motor against link."""
-        # The stiffness, and the damping at damping ratio 1.
-        frequency = cls.stiffest / model.opt.timestep
+        # Largest stiffness that the timestep resolves, and the damping at damping ratio 1.
+        frequency = STIFFEST / model.opt.timestep
         stiffness = rounded(reduced * frequency**2)
         damping = rounded(2.0 * reduced * frequency)
         spring = cls.spring.format(table.name)
@@ -352,7 +351,7 @@ class JointElasticity(Term):
                 value=1.0 / stiffness,
                 unit=COMPLIANCE_UNITS[at.unit],
                 size=1.0 / stiffness,
-                bounds=((cls.stiffest / STIFFEST_OF_FIT) ** 2 / stiffness, np.inf),
+                bounds=((STIFFEST / STIFFEST_OF_FIT) ** 2 / stiffness, np.inf),
                 numbers=((f"{spring}:stiffness", 1.0),),
             ),
             "damping": TermQuantity(
@@ -426,9 +425,6 @@ class Backlash(JointElasticity):
     size = "gap"
     estimated = ()
     damping_ratio = 0.05
-    # The flanks of gears are far stiffer than a timestep resolves. Softer ones would bias a fit
-    # more than the gap does.
-    stiffest = 0.9
     spring = "tendon/{}_gap"
 
     @classmethod

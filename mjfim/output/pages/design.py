@@ -157,7 +157,8 @@ def _verdict(design: Design) -> Verdict:
     if not (ok or reservation):
         reservation = "the search was interrupted"
     if reservation:
-        text = f"This motion can be played, but {reservation}. {_gain(design)}{seen}"
+        played = f"This motion can be played{_at_end(rehearsal)}"
+        text = f"{played}, but {reservation}. {_gain(design)}{seen}"
         return Verdict(text, Level.DOUBTFUL, ok)
     text = f"Ready to play{_at_end(rehearsal)}: {_accuracy(design)}. {_gain(design)}{seen}"
     return Verdict(text, Level.GOOD, ok)
@@ -269,7 +270,7 @@ def _observed(rehearsal: Rehearsal) -> Iterator[str]:
 
 def _at_end(rehearsal: Rehearsal) -> str:
     """What must happen after a motion that does not end at rest."""
-    return "" if rehearsal.at_rest else ", then stop it or let it swing out"
+    return "" if rehearsal.at_rest else ", then stop it"
 
 
 def _moving_at_end(rehearsal: Rehearsal) -> list[str]:
@@ -372,8 +373,10 @@ def _accuracy(design: Design) -> str:
         return sentence
     worst = max(wanted, key=lambda j: shares[j])
     name = design.parameters[worst]
-    before, after = float(design.initial.std[worst]), float(design.stated_std[worst])
-    sentence += f" with a σ of {relative(after, design.sizes[worst])} or less"
+    before, after = float(design.initial.std[worst]), float(design.final.std[worst])
+    sentence += (
+        f" with a σ of {relative(float(design.stated_std[worst]), design.sizes[worst])} or less"
+    )
     if not np.isfinite(before):
         return f"{sentence}; the initial motion does not determine {name}"
     if before > SMALL_GAIN * after:
