@@ -78,7 +78,8 @@ def test_a_wrong_start_finds_the_truth_over_many_swings(
     )
     require_found(found, system.parameters.true)
     assert not found.missing_terms
-    if start == START:
+    # Some searches find the truth without shorter segments.
+    if found.restart is not None:
         first, then, *_, last = phases
         assert (first, last) == ("all data", "again all data")
         assert then.startswith("segments of")
