@@ -245,9 +245,12 @@ def _nuisance(
     """
     stated, coordinates = experiment.nuisance, source.coordinates
     # A contact holds its joint, so that no deviation of it stays.
-    held = {joint for term in source.terms.values() for joint in term.held_joints}
-    deviations = [c for c in coordinates.deviations if c.name.partition(":")[2] not in held]
-    paths = {c.name: c.path for c in deviations if c.path}
+    held = source.held_joints
+    paths = {
+        c.name: c.path
+        for c in coordinates.deviations
+        if c.path and c.name.partition(":")[2] not in held
+    }
     units = {c.name: c.unit for c in coordinates.deviations}
     unnamed = coordinates.unnamed_joints
     if unnamed and stated.initial is not None and not isinstance(stated.initial, Mapping):

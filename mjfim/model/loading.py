@@ -250,10 +250,15 @@ class ModelSource:
         contents = {file.resolve(): each for file, each in self.stated.contents.items()}
         return contents.get(path.resolve()) or path.read_bytes()
 
-    @property
+    @cached_property
     def added(self) -> frozenset[int]:
         """Addresses in the state (qpos, qvel) that physical terms have added."""
         return frozenset() if self.layout is None else self.layout.added
+
+    @cached_property
+    def held_joints(self) -> frozenset[str]:
+        """Joints that physical terms have added and that contacts hold."""
+        return frozenset(joint for term in self.terms.values() for joint in term.held_joints)
 
     @cached_property
     def coordinates(self) -> ModelCoordinates:

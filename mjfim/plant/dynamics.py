@@ -120,10 +120,9 @@ class Dynamics:
         # (nx,) 0 for coordinates that contacts hold, else 1. Differences along them would be those
         # of impacts. The rest of the state determines them within some engine steps.
         self.moves_freely = np.ones(self.space.nx)
-        for term in source.source.terms.values():
-            for joint in term.held_joints:
-                dof = int(source.model.joint(joint).dofadr[0])
-                self.moves_freely[[dof, self.space.nv + dof]] = 0.0
+        for joint in source.source.held_joints:
+            dof = int(source.model.joint(joint).dofadr[0])
+            self.moves_freely[[dof, self.space.nv + dof]] = 0.0
         self.nominal_initial_state = np.array(nominal_initial_state, dtype=np.float64)
         self.initial_state_derivative = parameters.initial_state_derivative(self.space.nx)
         self.calibration = Calibration(
