@@ -162,7 +162,9 @@ COMPLETE_STEP = 1.1
 MIN_RATIO_TO_LENGTHEN = 1.2
 MAX_LENGTHENING = 3.0
 
-# Largest part of a step without damping that is tried, and a limit below which none is.
+# Number of iterations after which a part of a step without damping is tried, the largest part, and
+# a limit below which none is tried.
+MANY_ITERATIONS = 15
 FIRST_PART = 0.25
 LAST_PART = 0.05
 
@@ -519,13 +521,15 @@ class _Search:
 
         Damping shortens steps most along combinations that the data determine little, such as the
         common scale of gains, friction and inertia. Where residuals are rough in other directions,
-        the damping stays large, and such a search would creep.
+        the damping stays large, and such a search would creep. In the first iterations, such parts
+        lead searches astray that damped steps bring to the minimum.
 
         Args:
             trial: The accepted step from the present unknowns.
             predicted: The step without damping.
         """
-        fraction = FIRST_PART if self.damping > INITIAL_DAMPING else 0.0
+        is_slow = self.iteration > MANY_ITERATIONS and self.damping > INITIAL_DAMPING
+        fraction = FIRST_PART if is_slow else 0.0
         while fraction > LAST_PART and self.budget.exhausted is None:
             expected = SMALL_SHARE * fraction * predicted.predicted_decrease
             if self.cost - trial.cost >= expected:

@@ -702,7 +702,7 @@ def residual_torque(found: Sequence[ResidualForce], *, is_explained: bool = Fals
         title = "too few points in both directions"
         if np.isfinite(step):
             viscous = _with_unit(slope, f"{each.unit} s/{length}")
-            title = f"missing friction {_with_unit(step, each.unit)}, viscous {viscous}"
+            title = f"step {_with_unit(step, each.unit)}, slope {viscous}"
         rms = f"rms {_with_unit(each.rms, each.unit)}{_over_noise(each)}"
         panels += [
             _force_panel(each, each.speed, f"speed [{length}/s]", title),
