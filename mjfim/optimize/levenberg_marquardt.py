@@ -521,15 +521,15 @@ class _Search:
 
         Damping shortens steps most along combinations that the data determine little, such as the
         common scale of gains, friction and inertia. Where residuals are rough in other directions,
-        the damping stays large, and such a search would creep. In the first iterations, such parts
-        lead searches astray that damped steps bring to the minimum.
+        the damping stays large, and such a search would creep. Short searches need no such parts,
+        and take more iterations with them.
 
         Args:
             trial: The accepted step from the present unknowns.
             predicted: The step without damping.
         """
-        is_slow = self.iteration > MANY_ITERATIONS and self.damping > INITIAL_DAMPING
-        fraction = FIRST_PART if is_slow else 0.0
+        may_creep = self.iteration > MANY_ITERATIONS and self.damping > INITIAL_DAMPING
+        fraction = FIRST_PART if may_creep else 0.0
         while fraction > LAST_PART and self.budget.exhausted is None:
             expected = SMALL_SHARE * fraction * predicted.predicted_decrease
             if self.cost - trial.cost >= expected:
