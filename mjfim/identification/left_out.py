@@ -61,8 +61,10 @@ SEARCH = SearchSettings(
 )
 INITIAL_STATES = replace(SEARCH, rough_share=1e-3)
 
-# First rows of a segment that show its initial state. Later ones hardly do, and cost time.
-INITIAL_STATE_ROWS = 1000
+# First rows of a segment that show its initial state, more of them as long as they lower the cost,
+# and number of iterations with more rows. Later rows hardly show it, and cost time.
+INITIAL_STATE_ROWS = (125, 250, 500, 1000)
+ITERATIONS_WITH_MORE_ROWS = 2
 
 # Share of the predicted decrease of the cost that a step to the fit without a part may miss. The
 # errors of predictions hardly change with what is left of it.
@@ -200,11 +202,23 @@ def with_initial_states(
     # Deviations of the initial state that were fitted belong to other recordings.
     begin = replace(at, private=problem.begin(problem.parameters.guess).private)
     held = problem.masked(_other_values(problem, masks)).with_shared_held()
-    first = held.of_first_parts(1.0, INITIAL_STATE_ROWS)
-    if len(first.segments_with_values) == len(held.segments):
-        held = first
-    found = minimise(held, begin, INITIAL_STATES, budget)
-    return problem, at if found is None else found.unknowns
+    # Parameters of single recordings may act later than an initial state.
+    rows = INITIAL_STATE_ROWS[-1:] if len(problem.per_recording) else INITIAL_STATE_ROWS
+    parts = [held.of_first_parts(1.0, most) for most in rows]
+    parts = [part for part in parts if len(part.segments_with_values) == len(held.segments)]
+    settings = INITIAL_STATES
+    for number, part in enumerate(parts or [held]):
+        cost = part.cost(begin) if number else np.nan
+        found = minimise(part, begin, settings, budget)
+        if found is None:
+            break
+        at = begin = found.unknowns
+        is_lost = cost - found.cost <= settings.stagnant_share * cost
+        is_whole = part.sample_count == held.sample_count
+        if is_lost or is_whole or budget.exhausted is not None:
+            break
+        settings = replace(settings, max_iterations=ITERATIONS_WITH_MORE_ROWS)
+    return problem, at
 
 
 def fit_without(
@@ -365,9 +379,16 @@ def _standard_error(sums: Array, counts: Array) -> float:
 
 
 def held_out_losses(
-    problem: FitProblem, solution: Solution, sigma: Array, budget: Budget
+    problem: FitProblem,
+    solution: Solution,
+    sigma: Array,
+    budget: Budget,
+    to_beat: HeldOutLosses | None = None,
 ) -> HeldOutLosses | None:
     """Predict every part of the data by a fit to the other parts.
+
+    A model that has lost more than another one on all parts cannot predict better. The other parts
+    are not predicted then, and count as predicted without error.
 
     Args:
         problem: Problem of all data, with the noise by which the fits weight them.
@@ -375,6 +396,7 @@ def held_out_losses(
         sigma: (ny,) noise by which errors are divided before they are compared [y-unit]. It has to
             be the same for all models that are compared.
         budget: Ends the work early.
+        to_beat: Losses of a model that predicts the same blocks; None to predict all parts.
 
     Returns:
         The losses; None after a request to stop, and where there are no parts that can be left out.
@@ -383,10 +405,22 @@ def held_out_losses(
     parts = _parts(problem)
     work = partial(_losses_of_part, solution=solution, blocks=blocks_of(parts), sigma=sigma)
     works = [partial(work, part=part) for part in parts]
-    found = [losses for losses in of_parts(problem, works, budget) if losses is not None]
+    found: list[HeldOutLosses] = []
+    lost, most = 0.0, np.inf if to_beat is None else to_beat.losses.sum()
+    for losses in of_parts(problem, works, budget):
+        if losses is not None:
+            found.append(losses)
+            lost += losses.losses.sum()
+        if lost > most:
+            break
     if budget.exhausted is not None or not found:
         return None
-    return joined_losses(found)
+    joined = joined_losses(found)
+    if to_beat is None or lost <= most:
+        return joined
+    unpredicted = np.zeros(len(to_beat.losses) - len(joined.losses))
+    all_losses = np.concatenate([joined.losses, unpredicted])
+    return replace(to_beat, losses=all_losses, estimates=joined.estimates)
 
 
 def _parts(problem: FitProblem) -> tuple[LeftOutPart, ...]:

@@ -554,8 +554,9 @@ class FitSearch:
                 return longer, found
 
             # The lower cost counts, but not its linearisation by longer differences.
-            condensed = problem.condense(found.unknowns)
-            if condensed is not None and found.cost < solution.cost:
+            is_lower = found.cost < solution.cost
+            condensed = problem.condense(found.unknowns) if is_lower else None
+            if condensed is not None:
                 solution = replace(found, condensed=condensed)
         return problem, solution
 

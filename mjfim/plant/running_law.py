@@ -165,7 +165,7 @@ class LawCommands:
     """Commands of c laws for m curves at K evaluations, of which `before` precede the curves.
 
     Attributes:
-        before: Number of evaluations before the first one of the curves.
+        before: 1; 0 where the inputs show no evaluation before the curves.
         rest: (m, c) parts of a tick by which commands are later than whole ticks.
         reference: (K, m, c) references, filtered and after the motion profile, without `rest`
             [m or rad].
@@ -243,18 +243,21 @@ class LawCommands:
         begin = -0.5 * ticks.period / ticks.substeps
         middle = columns.at("reference", lead + begin - 0.5 * latency[None])
         kept_back = ticks.seconds * (1.0 - shares) / shares
-        latest = _earlier(filtered, rest)[max(ticks.before - 1, 0)]
-        behind = _earlier(filtered - reference, rest)[: ticks.before].sum(axis=0)
+        before = filtered[: max(ticks.before, 1)]
+        latest = _earlier(before[-2:], rest)[-1]
+        behind = _earlier((filtered - reference)[: ticks.before], rest).sum(axis=0)
 
-        enabled = columns.at_once("enable")
+        # Of earlier evaluations, the laws need the last one.
+        needed = slice(max(ticks.before - 1, 0), None)
+        enabled = columns.at_once("enable", needed)
         return cls(
-            before=ticks.before,
+            before=min(ticks.before, 1),
             rest=rest,
-            reference=reference,
-            profile_velocity=slope,
-            reference_velocity=velocity,
-            feedforward=columns.if_read("feedforward", begins),
-            gain=columns.at_once("gain"),
+            reference=reference[needed],
+            profile_velocity=slope[needed],
+            reference_velocity=None if velocity is None else velocity[needed],
+            feedforward=columns.if_read("feedforward", begins[needed]),
+            gain=columns.at_once("gain", needed),
             enabled=None if enabled is None else np.where(enabled >= ON, 1.0, 0.0),
             lag=numbers.latency * middle[0] + kept_back * latest + ticks.seconds * behind,
             lag_time=numbers.latency + kept_back,
@@ -329,15 +332,15 @@ class _Columns:
             return None
         return self.at(quantity, places)
 
-    def at_once(self, quantity: Quantity) -> Array | None:
-        """(K, m, c) quantity at the ticks, without latency, 1 for laws that do not read it.
+    def at_once(self, quantity: Quantity, ticks: slice) -> Array | None:
+        """(k, m, c) quantity at some ticks, without latency, 1 for laws that do not read it.
 
         None where no law reads it.
         """
         if not any(quantity in law.columns for law in self.laws):
             return None
         last = self.window.shape[1] - 1
-        sample = np.clip(np.floor(self.places), 0, last).astype(np.intp)
+        sample = np.clip(np.floor(self.places[ticks]), 0, last).astype(np.intp)
         return self._values(quantity, sample, 1.0)
 
     def _values(self, quantity: Quantity, sample: np.ndarray, otherwise: float) -> Array:
@@ -392,7 +395,9 @@ def _filtered(values: Array, shares: Array) -> Array:
 
 def _earlier(values: Array, part: Array | float = 1.0) -> Array:
     """Values: (K, m, c) of which a part: (m, c) is that of the tick before."""
-    return values - part * np.diff(values, axis=0, prepend=values[:1])
+    earlier = values.copy()
+    earlier[1:] -= part * np.diff(values, axis=0)
+    return earlier
 
 
 def _profiled(
@@ -426,15 +431,16 @@ def _profiled(
         p, v = memory.reference[chosen], memory.profile_velocity[chosen]
     path, slopes = x.copy(), np.zeros_like(x)
     path[max(first - 1, 0)] = p
-    square, twice = 0.25 * largest**2, 2.0 * largest / T
+    half, square, twice = 0.5 * largest, 0.25 * largest**2, 2.0 * largest / T
+    has_jump = np.asarray(jumps.any(axis=1))
     for k in range(first, len(x)):
         error = x[k] - p
         size = np.abs(error)
-        fastest = np.minimum(np.sqrt(square + twice * size) - 0.5 * largest, size / T)
-        wanted = np.copysign(fastest, error)
-        v = np.clip(wanted, v - largest, v + largest)
-        v[jumps[k]] = 0.0
-        p = np.where(jumps[k], x[k], p + T * v)
+        fastest = np.minimum(np.sqrt(square + twice * size) - half, size / T)
+        v = _clipped(np.copysign(fastest, error), v - largest, v + largest)
+        p = p + T * v
+        if has_jump[k]:
+            p, v = np.where(jumps[k], x[k], p), np.where(jumps[k], 0.0, v)
         path[k], slopes[k] = p, v
 
     reference = values.copy()
@@ -629,9 +635,8 @@ class RunningLaws:
             drive += numbers.kd * commands.reference_velocity
         gain = 1.0 if commands.gain is None else commands.gain
         feedforward = commands.feedforward
-        added = np.zeros_like(drive) if feedforward is None else feedforward
-        self._drive = gain * drive + added
-        self._next = ticks.before
+        self._drive = gain * drive + (0.0 if feedforward is None else feedforward)
+        self._next = commands.before
 
         seconds = ticks.seconds
         self._seconds = seconds
@@ -654,7 +659,8 @@ class RunningLaws:
         has_rest = bool(commands.rest.any())
         self._mixes = has_rest and self._has_limits
         if has_rest:
-            self._drive_before = gain * _earlier(drive) + _earlier(added)
+            added = 0.0 if feedforward is None else _earlier(feedforward)
+            self._drive_before = gain * _earlier(drive) + added
         if has_rest and not self._has_limits:
             self._drive = self._drive + commands.rest * (self._drive_before - self._drive)
 

@@ -348,9 +348,10 @@ class SelectionStep(Record):
         description: The term in words; empty for the stated model.
         path: Target of its parameter; empty for the stated model.
         count: Number of added terms after the step.
-        error: Held-out error of the model with the term, or without a removed one [sigma]; NaN
-            where no part of the data could be predicted from the others, and where the fit with the
-            term is no better than without it.
+        error: Held-out error of the model with the term, or without a removed one [sigma]; its
+            least value where the first parts show that the term is of no use; NaN where no part of
+            the data could be predicted from the others, and where the fit with the term is no
+            better than without it.
         reduction: Reduction of the mean held-out loss by the term [sigma^2].
         standard_error: Standard error of the reduction [sigma^2].
         sigmas: Size of the term in standard deviations by the score test; 0 where none was made.

@@ -26,7 +26,7 @@ from mjfim.identification.assessment.term_tests import find_missing_terms, with_
 from mjfim.identification.fit_problem import have_same_initial_states
 from mjfim.identification.fit_workers import FitWorkers
 from mjfim.identification.identify import Callback, fit_task, is_doubtful, refit_task
-from mjfim.identification.left_out import held_out_losses
+from mjfim.identification.left_out import HeldOutLosses, held_out_losses
 from mjfim.identification.search import FitSearch, FitTask, with_length
 from mjfim.identification.starts import MIN_ROWS
 from mjfim.parallel import ExecutorLike, one_blas_thread
@@ -540,7 +540,7 @@ class _Selector:
         if _are_comparable(model, fit) and is_no_better and fit.cost <= model.cost + EQUAL_COST:
             self.steps.append(step)
             return None
-        extended = self._assessed(fit)
+        extended = self._assessed(fit, model.losses)
         if extended is None:
             return None
         reduction, standard_error = model.losses.reduction(extended.losses)
@@ -602,12 +602,14 @@ class _Selector:
         weighted = result.problem.with_noise(self.first.result.problem.noise)
         return weighted.cost(result.solution.unknowns)
 
-    def _assessed(self, model: FittedModel | None) -> FittedModel | None:
+    def _assessed(
+        self, model: FittedModel | None, to_beat: HeldOutLosses | None = None
+    ) -> FittedModel | None:
         """A fitted model with its losses; None without a fit, and after a request to stop."""
         if model is None:
             return None
         sigma, result = self.first.result.problem.noise.sigma, model.result
-        losses = held_out_losses(result.problem, result.solution, sigma, self.budget)
+        losses = held_out_losses(result.problem, result.solution, sigma, self.budget, to_beat)
         return None if losses is None else replace(model, losses=losses, tests=None)
 
     def _search(self, task: FitTask) -> FitSearch:

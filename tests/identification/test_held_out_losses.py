@@ -96,7 +96,8 @@ def test_a_single_recording_is_predicted_in_parts(segments: float | str, parts: 
     """Each part is a stretch of the recording, also of a whole one or of two segments."""
     problem = fit_of(cart_pendulum(horizon=1.5, fit={"segments": segments}), 1).problem()
     solution = least_squares(problem, np.array([2.0, 1.0, 1.0]))
-    found = held_out_losses(problem, solution, problem.noise.sigma, Budget())
+    given = problem, solution, problem.noise.sigma, Budget()
+    found = held_out_losses(*given)
 
     # All values are predicted once.
     assert len(found.estimates) == parts
@@ -108,6 +109,11 @@ def test_a_single_recording_is_predicted_in_parts(segments: float | str, parts: 
     assert (found.jackknife < 4.0 * std).all()
     assert (found.jackknife > std / 4.0).all()
     assert found.error == pytest.approx(1.0, abs=0.2)
+
+    # Parts after those that show a model to predict worse are not predicted.
+    worse = held_out_losses(*given, replace(found, losses=0.2 * found.losses))
+    assert len(worse.estimates) < parts
+    assert found.error > worse.error > found.error * 0.2**0.5
 
 
 TIGHT = SearchSettings(tolerance=1e-6)

@@ -14,7 +14,6 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from mjfim.errors import MjfimError
-from mjfim.output import words
 from mjfim.output.archive import rotation_vectors
 from mjfim.output.panels import Mark, Panel, Picture, range_of_intervals
 from mjfim.output.plots.design import (
@@ -31,7 +30,14 @@ from mjfim.output.plots.estimate_studies import Spread, estimate_pairs, pairs, s
 from mjfim.output.plots.pictures import draw, picture_names, pictures_of, usual
 from mjfim.output.plots.studies import check, histogram
 from mjfim.output.report import report_of
-from mjfim.output.words import relative
+from mjfim.output.words import (
+    format_number,
+    format_with_uncertainty,
+    quotient_unit,
+    relative,
+    squared_unit,
+    without_zeros,
+)
 from mjfim.records.base import listed_values
 from mjfim.records.design import LimitUsage
 from mjfim.records.estimate import Estimate
@@ -454,17 +460,17 @@ def test_wrong_names_and_endings_are_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("shown", "text"),
     [
-        (words.format_number(0.87398), "0.874"),
-        (words.format_number(-4.1e-5), "−4.10×10⁻⁵"),
-        (words.format_number(999.9), "1000"),
-        (words.format_number(-np.inf), "−∞"),
-        (words.format_number(np.nan), "–"),
-        (words.quotient_unit("rad/s", "kg m²"), "(rad/s)/(kg m²)"),
-        (words.quotient_unit("", "kg"), "1/kg"),
-        (words.squared_unit("N m"), "(N m)²"),
-        (words.format_with_uncertainty(0.99412, 0.0123), "0.994 ± 0.012"),
-        (words.format_with_uncertainty(1e-7, 1e-9), "1.000×10⁻⁷ ± 1.0×10⁻⁹"),
-        (words.without_zeros("0.05000"), "0.05"),
+        (format_number(0.87398), "0.874"),
+        (format_number(-4.1e-5), "−4.10×10⁻⁵"),
+        (format_number(999.9), "1000"),
+        (format_number(-np.inf), "−∞"),
+        (format_number(np.nan), "–"),
+        (quotient_unit("rad/s", "kg m²"), "(rad/s)/(kg m²)"),
+        (quotient_unit("", "kg"), "1/kg"),
+        (squared_unit("N m"), "(N m)²"),
+        (format_with_uncertainty(0.99412, 0.0123), "0.994 ± 0.012"),
+        (format_with_uncertainty(1e-7, 1e-9), "1.000×10⁻⁷ ± 1.0×10⁻⁹"),
+        (without_zeros("0.05000"), "0.05"),
     ],
 )
 def test_numbers_have_three_digits_and_raised_powers(shown: str, text: str) -> None:

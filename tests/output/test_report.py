@@ -37,6 +37,7 @@ from mjfim.output.report import KINDS, Media, media_in, report_of, write_report
 from mjfim.output.video import Video
 from mjfim.records.base import ShownRecord
 from tests.support import results
+from tests.support.results import MAKERS
 
 # A name that would change the page, or run, if it were not escaped.
 HOSTILE = "<script>alert(1)</script>"
@@ -48,7 +49,7 @@ MAX_SIZE = 8_000_000
 @cache
 def record_of(verb: str) -> ShownRecord:
     """The made-up result of a verb."""
-    return results.MAKERS[verb]()
+    return MAKERS[verb]()
 
 
 @cache
@@ -78,7 +79,7 @@ def numbers(array: dict[str, str]) -> np.ndarray:
 # ---- the file
 
 
-@pytest.mark.parametrize("verb", results.MAKERS)
+@pytest.mark.parametrize("verb", MAKERS)
 def test_a_report_needs_no_other_file_and_shows_everything(verb: str) -> None:
     html, page = html_of(verb), page_of(record_of(verb))
     data = data_of(html)
@@ -120,11 +121,11 @@ def test_a_report_needs_no_other_file_and_shows_everything(verb: str) -> None:
         Figure(data=panel["traces"], layout=panel["layout"])
 
 
-@pytest.mark.parametrize("verb", results.MAKERS)
+@pytest.mark.parametrize("verb", MAKERS)
 def test_names_of_others_are_escaped(verb: str) -> None:
     """A name with a script stays a text, in the page and in the data of the plots."""
     names = {"name": HOSTILE} if verb in ("design", "identify", "rehearse") else {}
-    record = results.MAKERS[verb](parameters=(HOSTILE, "<img src=x>", "a & b"), **names)
+    record = MAKERS[verb](parameters=(HOSTILE, "<img src=x>", "a & b"), **names)
     html = report_of([record], [HOSTILE])
     assert HOSTILE not in html
     assert "<img src=x" not in html
@@ -262,7 +263,7 @@ def test_a_report_holds_every_result_of_a_folder_and_is_made_again_byte_for_byte
     tmp_path: Path,
 ) -> None:
     """The design stands above its check; the video stays, and is not rendered again."""
-    assert {results.MAKERS[verb]().__class__ for verb in results.MAKERS} == set(KINDS)
+    assert {MAKERS[verb]().__class__ for verb in MAKERS} == set(KINDS)
     check, design = results.check(), results.design()
     check.save(tmp_path)
     write_report(tmp_path, check)

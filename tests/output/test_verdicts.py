@@ -23,14 +23,14 @@ from mjfim.records.studies import DESIGN, CampaignStatus
 from tests.output.test_pages import ALONE, BROKEN, STOPPED, UNSTABLE, selection
 from tests.support import results
 from tests.support.pages import printed
-from tests.support.results import THETA
+from tests.support.results import THETA, evaluation
 
 GOOD, DOUBTFUL, BAD = Level.GOOD, Level.DOUBTFUL, Level.BAD
 WAITING = {"status": CampaignStatus.WAITING}
 LENGTH_UNKNOWN = {"theta": np.array([2.0, 1e-3, 1e-3])}
 
 # A search that ended where it began, but for the last digit of its control.
-START = results.evaluation(0.1, 50)
+START = evaluation(0.1, 50)
 CTRL = np.nextafter(START.trajectory.ctrl, np.inf)
 MOVED = {"final": replace(START, trajectory=replace(START.trajectory, ctrl=CTRL))}
 
@@ -84,7 +84,7 @@ BY_CHANCE = np.array([[1.01, 1.2], [0.9, 1.1], [0.9, 1.1]])
         ("design", {"rehearsal": results.rehearsal(**ALONE)}, DOUBTFUL, True, "no robot that"),
         ("design", {**MOVED, **STOPPED}, DOUBTFUL, False, "no better than its start"),
         ("design", MOVED, GOOD, True, "It is no better than its start."),
-        ("design", {"final": results.evaluation(0.01, 50)}, DOUBTFUL, True, "less than its start"),
+        ("design", {"final": evaluation(0.01, 50)}, DOUBTFUL, True, "less than its start"),
         ("identify", {}, GOOD, True, "explains the recordings"),
         ("identify", {"selection": selection()}, GOOD, True, "With dry friction of slide added, "),
         ("identify", {"misfit": True, "chi2": 800.0}, DOUBTFUL, False, "2.01 times the noise"),
@@ -285,7 +285,7 @@ RESERVES: dict[str, dict[str, float] | None] = {
 }
 # Whether smaller errors and feedback make the motion safe; None where they were not tried.
 TRIED = {"not tried": (None, None), "helps": (0.1, True), "does not": (np.nan, False)}
-SAME = results.evaluation(0.1, 50)
+SAME = evaluation(0.1, 50)
 SEARCHES: dict[str, dict[str, Any]] = {
     "converged": {},
     "stopped": {"status": Status.MAX_ITERATIONS, "improvement": 0.048},
@@ -339,7 +339,7 @@ def test_sentences_about_a_design_fit_together(
     is_safe = robots == "safe"
     advises_rest = robots == "unbraked" and end == "free"
     for is_exact, is_better, search in product((True, False), (True, False), SEARCHES):
-        final = results.evaluation(0.103, 50) if is_better else SAME
+        final = evaluation(0.103, 50) if is_better else SAME
         std = final.std if is_exact else 3.0 * final.std
         steps = replace(results.finite_steps(predicted=final.std), std=std)
         design = results.design(

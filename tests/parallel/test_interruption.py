@@ -14,21 +14,31 @@ from pathlib import Path
 import pytest
 
 from mjfim.errors import InterruptedByUserError
-from mjfim.parallel import budget as module
-from mjfim.parallel.budget import Interruption, StopToken, hurried, run_optional, stop_on_interrupt
+from mjfim.parallel.budget import (
+    FIRST_SENTENCE,
+    INTERRUPTED_CODE,
+    LAST_SENTENCE,
+    NOTHING_SENTENCE,
+    SIGNALS,
+    Interruption,
+    StopToken,
+    hurried,
+    run_optional,
+    stop_on_interrupt,
+)
 from tests.support.paths import ROOT
 
 
 @pytest.fixture
 def interruption() -> Iterator[Interruption]:
     """A handler in force."""
-    before = [signal.getsignal(number) for number in module.SIGNALS]
+    before = [signal.getsignal(number) for number in SIGNALS]
     with Interruption(lambda _: None) as handler:
         yield handler
-    assert [signal.getsignal(number) for number in module.SIGNALS] == before
+    assert [signal.getsignal(number) for number in SIGNALS] == before
 
 
-@pytest.mark.parametrize("number", module.SIGNALS)
+@pytest.mark.parametrize("number", SIGNALS)
 def test_nothing_is_kept_before_there_is_a_result(
     interruption: Interruption, number: signal.Signals
 ) -> None:
@@ -36,7 +46,7 @@ def test_nothing_is_kept_before_there_is_a_result(
         signal.raise_signal(number)
 
 
-@pytest.mark.parametrize("number", module.SIGNALS)
+@pytest.mark.parametrize("number", SIGNALS)
 def test_no_number_of_presses_ends_a_computation_from_outside(
     interruption: Interruption, number: signal.Signals
 ) -> None:
@@ -70,17 +80,17 @@ def test_signals_that_were_ignored_stay_so_but_for_sigterm(
     ignored: tuple[str, ...], other: Callable[..., None] | signal.Handlers
 ) -> None:
     """A shell ignores SIGINT in a background job, and `nohup` ignores SIGHUP."""
-    before = [signal.getsignal(number) for number in module.SIGNALS]
+    before = [signal.getsignal(number) for number in SIGNALS]
     try:
-        for number in module.SIGNALS:
+        for number in SIGNALS:
             signal.signal(number, signal.SIG_IGN if number.name in ignored else other)
-        for number in module.SIGNALS:
+        for number in SIGNALS:
             with Interruption(lambda _: None) as handler, stop_on_interrupt() as token:
                 signal.raise_signal(number)
                 assert token.requested is (number.name in HEARD[ignored])
             assert handler.presses == int(token.requested)
     finally:
-        for number, handled in zip(module.SIGNALS, before, strict=True):
+        for number, handled in zip(SIGNALS, before, strict=True):
             signal.signal(number, handled)
 
 
@@ -131,7 +141,7 @@ def test_what_a_press_says_is_said_before_the_end_of_the_context() -> None:
     with Interruption(say_late) as handler:
         handler.keep()
         signal.raise_signal(signal.SIGINT)
-    assert said == [module.FIRST_SENTENCE]
+    assert said == [FIRST_SENTENCE]
 
 
 # A module that is imported while the user presses.
@@ -173,7 +183,7 @@ def test_no_work_begins_after_a_press_during_an_import(
 def test_no_figure_begins_some_seconds_after_a_press(
     interruption: Interruption, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(module, "FINISH_SECONDS", 0.0)
+    monkeypatch.setattr("mjfim.parallel.budget.FINISH_SECONDS", 0.0)
     drawn = []
     interruption.keep()
     signal.raise_signal(signal.SIGINT)
@@ -211,7 +221,7 @@ with interruption.Interruption(lambda text: print(text, flush=True)) as handler:
 
 
 def test_two_presses_end_work_that_does_not_return() -> None:
-    assert_ended(ROOT, DEAF, said=[module.FIRST_SENTENCE, module.LAST_SENTENCE])
+    assert_ended(ROOT, DEAF, said=[FIRST_SENTENCE, LAST_SENTENCE])
 
 
 def assert_ended(folder: Path, *words: str, said: list[str]) -> None:
@@ -224,7 +234,7 @@ def assert_ended(folder: Path, *words: str, said: list[str]) -> None:
         env={**os.environ, "PYTHONPATH": os.pathsep.join([str(folder), str(ROOT)])},
         timeout=60.0,
     )
-    assert (ended.returncode, ended.stderr) == (module.INTERRUPTED_CODE, "")
+    assert (ended.returncode, ended.stderr) == (INTERRUPTED_CODE, "")
     assert ended.stdout.splitlines() == said
 
 
@@ -266,9 +276,9 @@ with interruption.Interruption(lambda text: print(text, flush=True)), replacing(
 @pytest.mark.parametrize(
     ("where", "presses", "said"),
     [
-        ("reading", 1, [module.NOTHING_SENTENCE]),
-        ("importing", 1, [module.NOTHING_SENTENCE]),
-        ("computing", 2, [module.FIRST_SENTENCE, module.LAST_SENTENCE]),
+        ("reading", 1, [NOTHING_SENTENCE]),
+        ("importing", 1, [NOTHING_SENTENCE]),
+        ("computing", 2, [FIRST_SENTENCE, LAST_SENTENCE]),
     ],
 )
 def test_code_that_calls_no_handler_is_ended(
