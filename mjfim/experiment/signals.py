@@ -413,7 +413,9 @@ def resolve_controllers(
 
 def _joint(source: ModelSource, actuator: str, spec: ControllerSpec) -> ScalarJoint:
     """The joint whose position a law controls."""
-    model = source.model
+    # A term may have moved the actuator from its joint to a tendon.
+    stated = source.stated
+    model = stated.model
     key = f"controllers.{actuator}"
     names = actuator_names(model)
     if actuator not in names:
@@ -435,8 +437,8 @@ def _joint(source: ModelSource, actuator: str, spec: ControllerSpec) -> ScalarJo
         return joints[spec.joint]
 
     driven = [
-        joint
-        for joint in joints.values()
+        joints[joint.name]
+        for joint in stated.coordinates.scalar_joints
         if acts_at_joint(model, number) and joint.joint == model.actuator_trnid[number, 0]
     ]
     if not driven:

@@ -293,5 +293,8 @@ def test_an_actuator_without_a_joint_needs_one(tmp_path: Path) -> None:
     with pytest.raises(ExperimentError, match=r"controllers\.elbow\.joint = 'shoulder'"):
         System.resolve(arm_experiment({"elbow": PD}, model=str(path)))
 
-    system = System.resolve(arm_experiment({"elbow": PD | {"joint": "elbow"}}, model=str(path)))
-    assert system.laws.laws[0].joint == "elbow"
+    # A term moves the motor from its joint to a tendon.
+    worm = {"worm": {"kind": "load_dependent_friction", "actuator": "elbow"}}
+    for law, tables in ((PD | {"joint": "elbow"}, {"model": str(path)}), (PD, {"terms": worm})):
+        system = System.resolve(arm_experiment({"elbow": law}, **tables))
+        assert system.laws.laws[0].joint == "elbow"

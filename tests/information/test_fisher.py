@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.random import default_rng
 from numpy.testing import assert_allclose
 
 from mjfim.excitation.design import design_task
@@ -51,7 +52,7 @@ def spread_matrix(rng: np.random.Generator, p: int = 4) -> np.ndarray:
 @pytest.mark.parametrize("criterion", ["E", "A", "D"])
 def test_criterion_is_that_of_the_scaled_information_per_second(criterion: str) -> None:
     made = information(criterion=criterion, weight=3.0)
-    matrix = spread_matrix(np.random.default_rng(3))
+    matrix = spread_matrix(default_rng(3))
     S = np.diag(made.scale)
     values = np.linalg.eigvalsh(S @ matrix @ S / 50.0)
     expected = {"E": 1 / values[0], "A": np.sum(1 / values), "D": -np.sum(np.log(values))}
@@ -61,11 +62,11 @@ def test_criterion_is_that_of_the_scaled_information_per_second(criterion: str) 
 
 
 NUISANCE = {"interest": np.array([0, 2])}
-TILTED = np.linalg.qr(np.random.default_rng(12).normal(size=(2, 1)))[0]
+TILTED = np.linalg.qr(default_rng(12).normal(size=(2, 1)))[0]
 SEEN = {
     "everything": {},
     "nuisance": NUISANCE,
-    "combinations": {"basis": np.linalg.qr(np.random.default_rng(11).normal(size=(4, 2)))[0]},
+    "combinations": {"basis": np.linalg.qr(default_rng(11).normal(size=(4, 2)))[0]},
     "both": {**NUISANCE, "basis": TILTED},
 }
 PHI = {
@@ -89,7 +90,7 @@ def seeing(phi: str, seen: str) -> FisherInformation:
 def test_derivative_through_nuisance_and_combinations_is_that_of_differences(
     phi: str, seen: str
 ) -> None:
-    rng, made = np.random.default_rng(4), seeing(phi, seen)
+    rng, made = default_rng(4), seeing(phi, seen)
     matrix = spread_matrix(rng)
     found = made.evaluate(matrix)
     M = (found.directions.T * found.weights) @ found.directions / made.measure_rate
@@ -100,7 +101,7 @@ def test_derivative_through_nuisance_and_combinations_is_that_of_differences(
 
 
 def test_the_information_without_nuisance_is_the_inverse_of_the_block_of_the_full_inverse() -> None:
-    matrix, t = spread_matrix(np.random.default_rng(13)), NUISANCE["interest"]
+    matrix, t = spread_matrix(default_rng(13)), NUISANCE["interest"]
     made = information(**NUISANCE)
     scaled = made.scaled(matrix)
     R, P = made.reduced(matrix)
@@ -111,7 +112,7 @@ def test_the_information_without_nuisance_is_the_inverse_of_the_block_of_the_ful
 
 def test_nuisances_that_are_confounded_with_each_other_do_not_matter() -> None:
     """There is twice one nuisance, and one of no effect."""
-    J = np.random.default_rng(15).normal(size=(20, 3))
+    J = default_rng(15).normal(size=(20, 3))
     same = np.column_stack([J[:, :2], 1e3 * J[:, 1], J[:, 2], np.zeros(20)])
     found, plain = (
         information(
@@ -124,7 +125,7 @@ def test_nuisances_that_are_confounded_with_each_other_do_not_matter() -> None:
 
 
 def test_a_wanted_parameter_confounded_with_a_nuisance_has_an_infinite_criterion() -> None:
-    J = np.random.default_rng(16).normal(size=(20, 3))
+    J = default_rng(16).normal(size=(20, 3))
     J[:, 1] = 2.0 * J[:, 2]
     made = information(prior=np.zeros((3, 3)), scale=np.ones(3), interest=np.array([0, 1]))
     assert made.evaluate(J.T @ J).value == np.inf
@@ -133,7 +134,7 @@ def test_a_wanted_parameter_confounded_with_a_nuisance_has_an_infinite_criterion
 
 def test_combinations_project_the_information_and_show_which_parameters_are_identifiable() -> None:
     """The experiment tells three numbers: the first and last parameter, and the sum of others."""
-    told = np.random.default_rng(17).normal(size=(30, 3))
+    told = default_rng(17).normal(size=(30, 3))
     J = told[:, [0, 1, 1, 2]]
     half = np.sqrt(0.5)
     basis = np.array([[1.0, 0.0, 0.0], [0.0, half, 0.0], [0.0, half, 0.0], [0.0, 0.0, 1.0]])
@@ -155,7 +156,7 @@ def test_criterion_c_without_a_contrast_is_refused() -> None:
 
 
 def test_long_trajectories_have_accumulated_standard_deviations_that_are_not_too_small() -> None:
-    rng = np.random.default_rng(3)
+    rng = default_rng(3)
     S = Sensitivity(psi=np.zeros((1501, 1, 4)), G=rng.normal(size=(1501, 3, 4)))
     made = information()
     found = made.accumulated_std(S)
@@ -181,7 +182,7 @@ def test_information_of_a_real_experiment_is_the_sum_with_its_noise_and_scale(tm
 
 
 def test_standard_deviations_survive_parameters_of_very_different_size() -> None:
-    rng = np.random.default_rng(9)
+    rng = default_rng(9)
     unit = spread_matrix(rng)
     scale = np.array([1.0, 1e6, 1e-6, 1.0])
     expected = np.sqrt(np.diag(np.linalg.inv(unit))) / scale
@@ -194,7 +195,7 @@ def test_information_and_accumulated_deviations_are_those_of_a_plain_sum(
     interest: np.ndarray | None,
 ) -> None:
     """Priors, correlated noise and nuisance parameters count; the known start does not."""
-    rng, strides = np.random.default_rng(7), np.array([1, 2, 3])
+    rng, strides = default_rng(7), np.array([1, 2, 3])
     S = Sensitivity(psi=rng.normal(size=(13, 5, 4)), G=rng.normal(size=(13, 3, 4)))
     covariance = np.array([[0.01, 0.03, 0.0], [0.03, 0.25, 0.0], [0.0, 0.0, 4.0]])
     made = replace(

@@ -23,7 +23,7 @@ from mjfim.records.studies import DESIGN, CampaignStatus
 from tests.output.test_pages import ALONE, BROKEN, STOPPED, UNSTABLE, selection
 from tests.support import results
 from tests.support.pages import printed
-from tests.support.results import THETA, evaluation
+from tests.support.results import THETA, evaluation, rehearsal
 
 GOOD, DOUBTFUL, BAD = Level.GOOD, Level.DOUBTFUL, Level.BAD
 WAITING = {"status": CampaignStatus.WAITING}
@@ -36,7 +36,7 @@ MOVED = {"final": replace(START, trajectory=replace(START.trajectory, ctrl=CTRL)
 
 # Eleven of the robots reach the clamp of a force, and one breaks a limit besides.
 CLAMPED: dict[str, Any] = {
-    "limits": tuple(replace(limit, kind="joint_force") for limit in results.rehearsal().limits[:1]),
+    "limits": tuple(replace(limit, kind="joint_force") for limit in rehearsal().limits[:1]),
     "margins": np.array([0.4, *[0.0] * 11, *[0.4] * 9])[:, None],
 }
 POOR = replace(results.check().rows[0], relative=4.0, std=4.0 * THETA[0])
@@ -78,10 +78,10 @@ BY_CHANCE = np.array([[1.01, 1.2], [0.9, 1.1], [0.9, 1.1]])
         ("design", {"status": Status.INTERRUPTED}, DOUBTFUL, False, ""),
         ("design", {"limits": {"position": -0.1}}, BAD, False, "violates limits (position)"),
         ("design", LENGTH_UNKNOWN, DOUBTFUL, True, "length, damping: σ is 1000 % of its size for"),
-        ("design", {"rehearsal": results.rehearsal(**BROKEN)}, BAD, False, "Do not play"),
+        ("design", {"rehearsal": rehearsal(**BROKEN)}, BAD, False, "Do not play"),
         ("design", {"rehearsal": None}, DOUBTFUL, True, "not rehearsed"),
-        ("design", {"rehearsal": results.rehearsal(**CLAMPED)}, DOUBTFUL, True, "only 9 of 20"),
-        ("design", {"rehearsal": results.rehearsal(**ALONE)}, DOUBTFUL, True, "no robot that"),
+        ("design", {"rehearsal": rehearsal(**CLAMPED)}, DOUBTFUL, True, "only 9 of 20"),
+        ("design", {"rehearsal": rehearsal(**ALONE)}, DOUBTFUL, True, "no robot that"),
         ("design", {**MOVED, **STOPPED}, DOUBTFUL, False, "no better than its start"),
         ("design", MOVED, GOOD, True, "It is no better than its start."),
         ("design", {"final": evaluation(0.01, 50)}, DOUBTFUL, True, "less than its start"),
@@ -107,7 +107,7 @@ BY_CHANCE = np.array([[1.01, 1.2], [0.9, 1.1], [0.9, 1.1]])
             "the recordings determine no parameter.",
         ),
         ("check", {}, GOOD, True, "σ of 2 %"),
-        ("check", {"rehearsal": results.rehearsal(**UNSTABLE)}, DOUBTFUL, True, "σ of 2 %"),
+        ("check", {"rehearsal": rehearsal(**UNSTABLE)}, DOUBTFUL, True, "σ of 2 %"),
         ("check", {"refused": ("too long",), "findings": ("a b",)}, DOUBTFUL, False, "A b."),
         (
             "check",
@@ -255,7 +255,7 @@ DETERMINED = {
 def test_a_design_and_a_fit_agree_on_what_is_determined(share: float) -> None:
     std = THETA * [0.01, share, 0.01]
     steps = results.finite_steps(predicted=std)
-    design = results.design(rehearsal=results.rehearsal(steps=steps))
+    design = results.design(rehearsal=rehearsal(steps=steps))
     verdict = page_of(replace(design, final=replace(design.final, std=std))).verdict
     words = DETERMINED[share]
     assert verdict.level is (Level.GOOD if words is None else Level.DOUBTFUL)
@@ -329,7 +329,7 @@ def test_sentences_about_a_design_fit_together(
 ) -> None:
     """In every state of its robots, reserve, end, σ, gain and search."""
     kept, (wrong, feedback) = RESERVES[reserve], TRIED[tried]
-    rehearsal = results.rehearsal(
+    rehearsed = rehearsal(
         **ROBOTS[robots],
         kept_reserve=kept,
         end=end,
@@ -343,7 +343,7 @@ def test_sentences_about_a_design_fit_together(
         std = final.std if is_exact else 3.0 * final.std
         steps = replace(results.finite_steps(predicted=final.std), std=std)
         design = results.design(
-            final=final, rehearsal=replace(rehearsal, steps=steps), **SEARCHES[search]
+            final=final, rehearsal=replace(rehearsed, steps=steps), **SEARCHES[search]
         )
         page = page_of(design, experiment="arm.toml", design=Path("made"))
         text = whole(page)
@@ -372,9 +372,9 @@ def test_sentences_about_a_design_fit_together(
 
     # The rehearsal alone, and checks of the design and of a start that moves like this.
     for result in (
-        rehearsal,
-        results.check(rehearsal=rehearsal, is_start=False),
-        results.check(rehearsal=rehearsal),
+        rehearsed,
+        results.check(rehearsal=rehearsed, is_start=False),
+        results.check(rehearsal=rehearsed),
     ):
         text = whole(page_of(result, experiment="arm.toml", design=Path("made")))
         is_start = "The start itself is not to be played" in text
