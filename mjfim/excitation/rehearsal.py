@@ -638,11 +638,12 @@ class _RobotPlayer:
         data = mujoco.MjData(model)
 
         def begin(ctrl: Array) -> float:
-            """Return to the end of the motion; the acceleration under a control."""
+            """Play one step from the end of the motion; the speed that a control leaves."""
             mujoco.mj_copyData(data, model, end)
             data.ctrl[:] = ctrl
-            mujoco.mj_forward(model, data)
-            return float(direction * data.qacc[dof])
+            # An acceleration may point the other way: strong damping acts within the step.
+            mujoco.mj_step(model, data)
+            return float(direction * data.qvel[dof])
 
         best = 0.5 * (bounds.lower + bounds.upper)
         for chosen in np.eye(len(best), dtype=bool):
@@ -653,11 +654,11 @@ class _RobotPlayer:
             )
         begin(best)
         for _ in range(len(self.ctrl) * self.steps_per_row):
+            if not limit.lower <= data.qpos[limit.index] <= limit.upper:
+                return True
             if data.qvel[dof] * direction <= 0.0:
                 break
             mujoco.mj_step(model, data)
-            if not limit.lower <= data.qpos[limit.index] <= limit.upper:
-                return True
         return False
 
     def _margins(self, motion: _Motion) -> Array:

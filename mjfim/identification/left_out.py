@@ -61,10 +61,8 @@ SEARCH = SearchSettings(
 )
 INITIAL_STATES = replace(SEARCH, rough_share=1e-3)
 
-# First rows of a segment that show its initial state, more of them as long as they lower the cost,
-# and number of iterations with more rows. Later rows hardly show it, and cost time.
-INITIAL_STATE_ROWS = (125, 250, 500, 1000)
-ITERATIONS_WITH_MORE_ROWS = 2
+# First rows of a segment that show its initial state. Later ones hardly do, and cost time.
+INITIAL_STATE_ROWS = 500
 
 # Share of the predicted decrease of the cost that a step to the fit without a part may miss. The
 # errors of predictions hardly change with what is left of it.
@@ -202,23 +200,11 @@ def with_initial_states(
     # Deviations of the initial state that were fitted belong to other recordings.
     begin = replace(at, private=problem.begin(problem.parameters.guess).private)
     held = problem.masked(_other_values(problem, masks)).with_shared_held()
-    # Parameters of single recordings may act later than an initial state.
-    rows = INITIAL_STATE_ROWS[-1:] if len(problem.per_recording) else INITIAL_STATE_ROWS
-    parts = [held.of_first_parts(1.0, most) for most in rows]
-    parts = [part for part in parts if len(part.segments_with_values) == len(held.segments)]
-    settings = INITIAL_STATES
-    for number, part in enumerate(parts or [held]):
-        cost = part.cost(begin) if number else np.nan
-        found = minimise(part, begin, settings, budget)
-        if found is None:
-            break
-        at = begin = found.unknowns
-        is_lost = cost - found.cost <= settings.stagnant_share * cost
-        is_whole = part.sample_count == held.sample_count
-        if is_lost or is_whole or budget.exhausted is not None:
-            break
-        settings = replace(settings, max_iterations=ITERATIONS_WITH_MORE_ROWS)
-    return problem, at
+    first = held.of_first_parts(1.0, INITIAL_STATE_ROWS)
+    if len(first.segments_with_values) == len(held.segments):
+        held = first
+    found = minimise(held, begin, INITIAL_STATES, budget)
+    return problem, at if found is None else found.unknowns
 
 
 def fit_without(
