@@ -373,8 +373,8 @@ def held_out_losses(
 ) -> HeldOutLosses | None:
     """Predict every part of the data by a fit to the other parts.
 
-    A model that has lost more than another one on all parts cannot predict better. The other parts
-    are not predicted then, and count as predicted without error.
+    A model whose losses on some parts exceed those of another model on all parts cannot predict
+    better. The other parts are not predicted then, and count as predicted without error.
 
     Args:
         problem: Problem of all data, with the noise by which the fits weight them.
