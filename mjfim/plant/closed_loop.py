@@ -11,6 +11,7 @@ from typing import Any, ClassVar, NoReturn
 
 import mujoco
 import numpy as np
+import scipy
 from mujoco.batch import Batch
 
 from mjfim.arrays import Array
@@ -120,6 +121,36 @@ class ClosedLoopSimulator(BatchSimulator):
             batch.bind("ctrl")[:, group.controls] = group.held
         with silence_mujoco_log(), np.errstate(over="ignore", invalid="ignore"):
             return self._run(batch, ctrl, groups)
+
+    def controls_along(self, model: Any, t: Array, states: Array, ctrl: Array) -> Array:
+        """Controls that the laws compute along a known motion from the begin of a recording.
+
+        Args:
+            model: A model with the numbers of the laws.
+            t: (n,) times of the states, at least four [s].
+            states: (n, ns) states, between which the motion is a cubic spline.
+            ctrl: (N, w) inputs, as those of `rollout`.
+
+        Returns:
+            (N, nu) mean controls over each sample.
+        """
+        N, nq = len(ctrl), self.space.nq
+        motion = scipy.interpolate.make_interp_spline(t, states, k=3)
+        inputs, begin = ctrl[None], np.zeros(1, dtype=np.intp)
+        context = InputContext.of_interval(inputs, begin, slice(0, N), 0, None)
+        found = np.zeros((N, self.model.nu))
+        columns, direct = self.laws.direct
+        found[:, direct] = ctrl[:, columns]
+        for i in range(len(self.laws.by_tick)):
+            group = self._group(i, [model], states[:1], inputs, context)
+            steps = np.arange(0, N * self.substeps, group.period)
+            # The last sample may end after the motion.
+            at = motion(np.minimum(steps * self.model.opt.timestep, t[-1]))[:, None]
+            pairs = zip(at[..., group.positions], at[..., nq + group.velocities], strict=True)
+            controls = np.concatenate([group.evaluate(q, v) for q, v in pairs])
+            held = np.repeat(controls, group.period, axis=0)[: N * self.substeps]
+            found[:, group.controls] = held.reshape(N, self.substeps, -1).mean(axis=1)
+        return found
 
     def _run(self, batch: Batch, ctrl: Array, groups: Sequence[RunningLaws]) -> Rollouts:
         """Simulate curves from one tick to the next.

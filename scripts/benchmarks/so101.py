@@ -234,6 +234,7 @@ def main() -> int:
     else:
         found = mjfim.identify(experiment, fitted, held_out=held_out)
     console.print(*found.warnings, sep="\n")
+    found.plot("residual_torque", file=output / "residual_torque.png")
     values = np.column_stack([found.theta, found.interval]).round(5).tolist()
     console.print(dict(zip(found.parameters, values, strict=True)))
     console.print(f"{(time.perf_counter() - begun) / 60.0:.1f} minutes")

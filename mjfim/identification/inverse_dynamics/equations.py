@@ -33,6 +33,8 @@ from mjfim.model.elements import translations
 from mjfim.model.targets import ModelField
 from mjfim.model.units import actuator_gear
 from mjfim.model.variants import RELAXED, Relaxation
+from mjfim.plant.batch import BatchSimulator
+from mjfim.plant.closed_loop import ClosedLoopSimulator
 from mjfim.plant.equation_of_motion import EquationOfMotion, MotionPoints
 from mjfim.plant.equation_of_motion import activations as simulated_activations
 from mjfim.records.estimate_parts import ResidualForce
@@ -416,7 +418,8 @@ def residual_forces(
 ) -> tuple[ResidualForce, ...]:
     """Compare the forces of the actuators with those that the model needs, at every point.
 
-    Points near the ends of a recording do not count, because noise is larger there.
+    Points near the ends of a recording do not count, because noise is larger there. Controls of
+    control laws are those that they compute along the measured motion.
 
     Args:
         system: The system on the grid of the recordings.
@@ -427,17 +430,16 @@ def residual_forces(
         The forces of the hinges and slides that have points.
 
     Raises:
-        ExperimentError: Control laws compute controls, and a force of such an actuator was not
-            measured.
         RecordingError: A degree of freedom was not measured.
     """
-    forces, laws = measured_forces(system, recordings), system.laws
+    laws, simulator = system.laws, system.plant.simulator
     system = system.without_laws()
+    forces = measured_forces(system, recordings)
     rng = np.random.default_rng(0)
     along = []
     for recording, theta in zip(recordings, thetas, strict=True):
         equations = MotionEquations.of(system, [recording], theta, forces=forces, laws=laws)
-        along.append(_series(equations, theta, rng))
+        along.append(_series(equations, simulator, theta, rng))
 
     names, is_slide = dof_names(system.model), translations(system.model)
     found = []
@@ -462,7 +464,10 @@ def residual_forces(
 
 
 def _series(
-    equations: MotionEquations, theta: Array, rng: np.random.Generator
+    equations: MotionEquations,
+    simulator: BatchSimulator,
+    theta: Array,
+    rng: np.random.Generator,
 ) -> tuple[Array, np.ndarray]:
     """Series along the one recording of some equations, by degree of freedom.
 
@@ -472,7 +477,7 @@ def _series(
     """
     (each,) = equations.recorded
     motion, space = each.motion, equations.system.space
-    residual, force = _residual(equations, each, theta)
+    residual, force = _residual(equations, simulator, each, theta)
 
     # The same motion with the noise that the splines leave.
     count = len(motion.t)
@@ -485,7 +490,7 @@ def _series(
         motion=replace(motion, qpos=qpos, qvel=qvel, qacc=motion.qacc + noise[2]),
         forces=each.forces + each.force_sigma * rng.standard_normal(each.forces.shape),
     )
-    by_noise = _residual(equations, noisy, theta)[0] - residual
+    by_noise = _residual(equations, simulator, noisy, theta)[0] - residual
 
     position = np.zeros_like(motion.qvel)
     position[:, space.scalar_v] = motion.qpos[:, space.scalar_q]
@@ -495,11 +500,16 @@ def _series(
 
 
 def _residual(
-    equations: MotionEquations, each: RecordedEquations, theta: Array
+    equations: MotionEquations, simulator: BatchSimulator, each: RecordedEquations, theta: Array
 ) -> tuple[Array, Array]:
     """(n, nv) forces of the actuators less those that the motion needs, and the former alone."""
-    model = equations.system.plant.model(theta)
-    (points,) = equations.points([model], each.motion, theta[None])
+    model, motion = equations.system.plant.model(theta), each.motion
+    if isinstance(simulator, ClosedLoopSimulator):
+        states = np.concatenate([motion.qpos, motion.qvel], axis=1)
+        ctrl = simulator.controls_along(model, motion.t, states, motion.recording.ctrl)
+        motion = replace(motion, recording=replace(motion.recording, ctrl=ctrl))
+        equations = replace(equations, laws=None)
+    (points,) = equations.points([model], motion, theta[None])
     needed, _, forces = equations.equation.terms(model, points)
     force, _ = equations.forces_along(each, forces)
     return force - needed, force
