@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
+from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
 from mjfim.identification.aligned_recording import align
 from mjfim.identification.inverse_dynamics import inverse_dynamics, residual_forces
@@ -16,15 +17,22 @@ from mjfim.output.plots.draw import figure_of
 from mjfim.output.plots.estimate import MAX_JOINTS, residual_torque
 from mjfim.records.estimate_parts import ResidualForce
 from mjfim.records.trajectory import Recording
-from tests.identification.test_inverse_dynamics import CART_PENDULUM, STATE, cart, cart_log
+from tests.identification.test_inverse_dynamics import (
+    CART_PENDULUM,
+    STATE,
+    cart,
+    cart_log,
+    servo,
+    servo_log,
+)
 
 # Dry friction of the robot's slide, which the model lacks [N].
 FRICTION = 0.5
 
 
-def forces_along(folder: Path, log: Recording) -> tuple[ResidualForce, ...]:
-    """Residual forces of the model without dry friction, at the parameters of the robot."""
-    system = System.resolve(cart(folder), threads=1)
+def forces_along(experiment: Experiment, log: Recording) -> tuple[ResidualForce, ...]:
+    """Residual forces at the guess."""
+    system = System.resolve(experiment, threads=1)
     return residual_forces(system, [align(system, log)], [system.parameters.guess])
 
 
@@ -35,8 +43,8 @@ def rough_log(folder: Path, sigma: float) -> Recording:
 
 
 def test_medians_step_by_the_friction_that_the_model_lacks(tmp_path: Path) -> None:
-    slide, hinge = forces_along(tmp_path, rough_log(tmp_path, 1e-3))
-    assert [slide.joint, slide.unit, hinge.joint, hinge.unit] == ["slide", "N", "hinge", "N m"]
+    slide, hinge = forces_along(cart(tmp_path), rough_log(tmp_path, 1e-3))
+    assert (slide.joint, slide.unit, hinge.unit) == ("slide", "N", "N m")
     for sign in (1.0, -1.0):
         for each, friction in ((slide, sign * FRICTION), (hinge, 0.0)):
             # Without the slowest median, in which noise mixes the directions.
@@ -51,7 +59,8 @@ def test_medians_step_by_the_friction_that_the_model_lacks(tmp_path: Path) -> No
 
 @pytest.mark.parametrize("sigma", [1e-3, 1e-2])
 def test_of_the_right_model_only_noise_remains(sigma: float, tmp_path: Path) -> None:
-    for each in forces_along(tmp_path, cart_log(cart(tmp_path), sigma)):
+    experiment = cart(tmp_path)
+    for each in forces_along(experiment, cart_log(experiment, sigma)):
         assert each.noise_ratio == pytest.approx(1.0, abs=0.5)
 
 
@@ -62,12 +71,18 @@ def test_measured_forces_replace_those_of_the_model(tmp_path: Path) -> None:
     log = cart_log(experiment, 1e-3, measured=measured)
     wrong = replace(log, ctrl=0.5 * log.ctrl)
     without = replace(wrong, y=wrong.y[:, :4], outputs=STATE)
-    system = System.resolve(experiment, threads=1)
-    shares = [
-        residual_forces(system, [align(system, each)], [system.parameters.guess])[0].share
-        for each in (wrong, without)
-    ]
+    shares = [forces_along(experiment, each)[0].share for each in (wrong, without)]
     assert shares[0] < 0.1 and shares[1] > 0.5
+
+
+def test_controls_of_a_law_follow_from_the_measured_motion(tmp_path: Path) -> None:
+    """A servo whose log has references alone, with dry friction that one of two models lacks."""
+    law, damping = {"kp": 30.0, "kd": 1.0, "latency": 0.01}, {"c": {"target": "joint/j:damping"}}
+    tables = {"controllers": {"s": law}, "noise": {"qpos:j": 1e-4}}
+    log = servo_log(servo(tmp_path, damping, friction=FRICTION, **tables), [0.3], 20.0)
+    for friction in (FRICTION, 0.0):
+        (joint,) = forces_along(servo(tmp_path, damping, friction=friction, **tables), log)
+        assert joint.friction[0] == pytest.approx(FRICTION - friction, abs=0.1 * FRICTION)
 
 
 def test_each_recording_has_its_own_parameters(tmp_path: Path) -> None:

@@ -113,31 +113,39 @@ def prepared(controllers: dict[str, Any], **tables: Any) -> tuple[System, Any, n
     return system, system.plant.model(system.parameters.guess), signals(system)
 
 
-def oracle(system: System, law: dict[str, Any], inputs: np.ndarray) -> np.ndarray:
-    """(SAMPLES + 1, ns) states by the plain loop."""
+def oracle(
+    system: System, law: dict[str, Any], inputs: np.ndarray, start: np.ndarray = START
+) -> tuple[np.ndarray, np.ndarray]:
+    """(SAMPLES + 1, ns) states and (SAMPLES, nu) mean controls by the plain loop."""
     theta = system.parameters.guess
     columns: dict[int, dict[str, np.ndarray]] = {0: {}, 1: {}}
     for name, column in zip(system.inputs, inputs.T, strict=True):
         quantity, _, actuator = name.partition(":")
         columns[("shoulder", "elbow").index(actuator)][quantity] = column
-    states, _ = simulate(
-        system.plant.model(theta), {0: plain(law, "shoulder")}, columns, system.dt, SAMPLES, START
+    states, controls = simulate(
+        system.plant.model(theta), {0: plain(law, "shoulder")}, columns, system.dt, SAMPLES, start
     )
-    return states
+    return states, controls.reshape(SAMPLES, -1, 2).mean(axis=1)
 
 
 @pytest.mark.parametrize(("name", "more"), [*((name, {}) for name in LAWS), ("profiled", FAST)])
 def test_a_law_equals_a_plain_loop(name: str, more: dict[str, float]) -> None:
     law = LAWS[name] | more
     system, model, inputs = prepared({"shoulder": law}, **({"rate": 200.0} if more else {}))
-    found = system.plant.simulator.rollout([model], START[None], inputs[None])
+    simulator = system.plant.simulator
+    found = simulator.rollout([model], START[None], inputs[None])
 
     assert found.finite.all()
-    expected = oracle(system, law, inputs)
+    expected, controls = oracle(system, law, inputs)
     assert_allclose(found.states[0], expected, atol=1e-11)
 
+    # Along the same motion, controls are the same. Between samples, the motion is a spline.
+    t = system.dt * np.arange(SAMPLES + 1)
+    atol = 0.03 if name in ("unequal", "linear") or more else 1e-9
+    assert_allclose(simulator.controls_along(model, t, expected, inputs), controls, atol=atol)
+
     # The law has an effect, so that a wrong law would be seen.
-    assert np.abs(expected - oracle(system, {"kp": 0.0}, inputs)).max() > 0.05
+    assert np.abs(expected - oracle(system, {"kp": 0.0}, inputs)[0]).max() > 0.05
 
 
 @pytest.mark.parametrize("jump", [{"jump": 0.15}, {}])
@@ -148,10 +156,7 @@ def test_a_step_has_its_effect_at_any_latency(jump: dict[str, float]) -> None:
     inputs = np.zeros((SAMPLES, 2))
     inputs[20:, 0] = 0.24
     late = np.arange(0.008, 0.0161, 0.0005)
-    models = []
-    for latency in late:
-        other = System.resolve(arm_experiment({"shoulder": law | {"latency": latency}}))
-        models.append(other.plant.model(other.parameters.guess))
+    models = [prepared({"shoulder": law | {"latency": latency}})[1] for latency in late]
 
     m = len(models)
     starts, logs = np.zeros((m, 4)), np.repeat(inputs[None], m, axis=0)
@@ -198,10 +203,8 @@ def test_a_law_on_the_voltage_of_a_motor_with_a_current(tmp_path: Path) -> None:
 
     found = system.plant.simulator.rollout([model], start[None], inputs[None])
 
-    made = plain({**law, "saturation": (-24.0, 24.0)}, "shoulder")
-    columns = {0: {"reference": inputs[:, 0]}, 1: {"ctrl": inputs[:, 1]}}
-    states, _ = simulate(model, {0: made}, columns, system.dt, SAMPLES, start)
-    assert_allclose(found.states[0], states, atol=1e-11)
+    expected, _ = oracle(system, {**law, "saturation": (-24.0, 24.0)}, inputs, start)
+    assert_allclose(found.states[0], expected, atol=1e-11)
 
 
 def test_measured_forces_are_those_of_the_law(tmp_path: Path) -> None:
@@ -211,10 +214,9 @@ def test_measured_forces_are_those_of_the_law(tmp_path: Path) -> None:
     noise = {"state": 1e-4, "torque": 0.1}
     system, model, inputs = prepared({"shoulder": LAWS["pd"]}, model=str(path), noise=noise)
     found = system.plant.simulator.rollout([model], START[None], inputs[None])
-    q, v = found.states[0, :-1, 0], found.states[0, :-1, 2]
-    expected = np.clip(60.0 * (inputs[:, 0] - q) - 4.0 * v, -20.0, 20.0)
-    assert_allclose(found.sensors[0, :-1, 0], expected, atol=1e-11)
-    assert np.ptp(expected) > 10.0
+    torques = found.sensors[0, :-1, 0]
+    assert_allclose(torques, found.controls[0, :, 0], atol=1e-11)
+    assert np.ptp(torques) > 10.0
 
 
 @pytest.mark.parametrize("name", LAWS)
@@ -222,18 +224,18 @@ def test_intervals_equal_one_rollout(name: str) -> None:
     """Long curves are simulated in intervals, between which laws remember everything."""
     system, model, inputs = prepared({"shoulder": LAWS[name], "elbow": LAWS["slow"]})
     plant, theta = system.plant, system.parameters.guess
-    whole = plant.simulator.rollout([model], START[None], inputs[None])
+    whole, lead = plant.simulator.rollout([model], START[None], inputs[None]), plant.lead(theta)
 
     # Memory for 7 samples, of which an interval takes whole ticks of both laws.
     numbers = 7 * system.grid.substeps * (1 + len(START))
-    padded = np.concatenate([np.repeat(inputs[:1], plant.lead(theta), axis=0), inputs])
+    padded = np.concatenate([np.repeat(inputs[:1], lead, axis=0), inputs])
     parts = list(
         plant.derivatives.responses(
             theta,
             START[None],
             padded[None],
-            lead=plant.lead(theta),
-            samples=np.array([-plant.lead(theta)]),
+            lead=lead,
+            samples=np.array([-lead]),
             max_numbers=numbers,
         )
     )
