@@ -233,16 +233,19 @@ def wrong_unit(number: Quantity, units: list[str]) -> str | None:
             f"{shown} has a unit, but the model does not say in which unit this number is; state "
             "a plain number in the model's unit"
         )
-    if any(not Unit.parse(unit).measures(Unit.parse(units[0])) for unit in units):
+    measured = [number.unit.measures(Unit.parse(unit)) for unit in units]
+    if all(measured):
+        return None
+    if any(measured):
         return (
             f"{shown} would stand for numbers in {' and '.join(units)}; state each of them by its "
             "name, or a plain number"
         )
-    if number.unit.measures(Unit.parse(units[0])):
-        return None
+    alike = list(dict.fromkeys(other for unit in units for other in units_like(unit)))
+    stated = " or ".join(units)
     return (
-        f"{shown} is no number in {units[0]}; valid are a plain number in {units[0]}, or the "
-        f"units {listed(units_like(units[0]))}"
+        f"{shown} is no number in {stated}; valid are a plain number in {stated}, or the units "
+        f"{listed(alike)}"
     )
 
 

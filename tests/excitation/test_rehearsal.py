@@ -455,7 +455,7 @@ def test_what_falls_below_the_floor_is_not_played(
         checked = mjfim.check(experiment.replace(limits=box), progress=False)
         assert not checked.is_dangerous and checked.violations
         warning = page_of(checked).warnings[0]
-        assert warning.startswith("The start itself is not to be played. Of 4 robots")
+        assert warning.startswith("Do not play the initial control. Of 4 robots")
 
 
 @pytest.mark.slow

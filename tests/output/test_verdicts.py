@@ -377,7 +377,7 @@ def test_sentences_about_a_design_fit_together(
         results.check(rehearsal=rehearsed),
     ):
         text = whole(page_of(result, experiment="arm.toml", design=Path("made")))
-        is_start = "The start itself is not to be played" in text
+        is_start = "Do not play the initial control" in text
         assert ("Do not play" in text or is_start) is not is_safe
         assert is_start or ("Let the motion end at rest" in text) is advises_rest
 

@@ -794,7 +794,7 @@ def _check_warnings(check: Check) -> Iterator[str]:
     rehearsal = check.rehearsal
     if check.is_start and rehearsal is not None and not (rehearsal.is_safe or check.is_dangerous):
         cure = next(_known_cures(rehearsal, is_designed=False), "A design looks for a better one.")
-        yield f"The start itself is not to be played. {_faults_of(rehearsal)}. {cure}"
+        yield f"Do not play the initial control. {_faults_of(rehearsal)}. {cure}"
     if not _has_no_fault(check):
         yield from (as_sentence(each) for each in check.findings[1:])
 

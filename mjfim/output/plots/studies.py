@@ -754,8 +754,11 @@ def _margins(result: Rehearsal) -> Panel:
                 role, label = NOMINAL, "robots, some reach the clamp"
         marks += _row(percent[:, i], i, role, label)
     names = [f"{limit.kind.replace('_', ' ')} {limit.name}" for limit in result.limits]
+    title = f"{result.all_kept} of {result.robots} robots keep all limits"
+    if result.unbraked:
+        title += f", {max(result.unbraked.values())} end too fast to be braked"
     return Panel(
-        title=f"{result.all_kept} of {result.robots} robots keep all limits",
+        title=title,
         marks=marks,
         x=Axis(label="margin over half of the range [%]", limits=(low, 105.0)),
         y=row_axis(names),
