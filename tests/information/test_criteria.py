@@ -34,9 +34,9 @@ def matrix(values: Array, seed: int = 0) -> Array:
     return Q @ np.diag(values) @ Q.T
 
 
-def symmetric(rng: np.random.Generator, p: int = 4) -> Array:
+def symmetric(rng: np.random.Generator) -> Array:
     """Random direction of unit norm in the symmetric matrices."""
-    d = rng.normal(size=(p, p))
+    d = rng.normal(size=(4, 4))
     return (d + d.T) / np.linalg.norm(d + d.T)
 
 

@@ -43,10 +43,10 @@ def information(stride: int = 1, criterion: str = "E", **changes) -> FisherInfor
     return replace(base, **changes)
 
 
-def spread_matrix(rng: np.random.Generator, p: int = 4) -> np.ndarray:
+def spread_matrix(rng: np.random.Generator) -> np.ndarray:
     """Symmetric positive definite with well separated eigenvalues."""
-    Q, _ = np.linalg.qr(rng.normal(size=(p, p)))
-    return Q @ np.diag(3.0 ** np.arange(p)) @ Q.T
+    Q, _ = np.linalg.qr(rng.normal(size=(4, 4)))
+    return Q @ np.diag(3.0 ** np.arange(4)) @ Q.T
 
 
 @pytest.mark.parametrize("criterion", ["E", "A", "D"])

@@ -48,6 +48,9 @@ ROUNDING = 1e-26
 # are left out.
 OUTLIER = 8.0
 
+# Standard deviation of a number that is rounded to multiples of 1.
+UNIFORM_SIGMA = 12.0**-0.5
+
 # Rounds in which outliers are left out, at most: a spline through outliers hides smaller ones.
 MAX_OUTLIER_ROUNDS = 3
 
@@ -78,12 +81,14 @@ class RegressionSpline:
 
     Attributes:
         curve: The spline.
+        t: (n,) times of the readings to which it is fitted [s].
         spacing: Distance of its knots [s].
         variance: Mean square of the residuals over the stated variances.
         weights: Values and slopes per second, over the variances of their noise.
     """
 
     curve: scipy.interpolate.BSpline
+    t: Array
     spacing: float
     variance: float
     weights: tuple[float, float]
@@ -132,6 +137,9 @@ def _without_outliers(spline: RegressionSpline, reading: Readings) -> Readings:
     """The readings that are not far from their spline."""
     distance = np.abs(reading.values - spline.at(reading.t, reading.derivative))
     usual = SIGMA_PER_MEDIAN * float(np.median(distance))
+    # Where a joint rests most of the time, the usual distance is less than an encoder resolves.
+    step = min(np.diff(np.unique(reading.values)).tolist(), default=0.0)
+    usual = max(usual, UNIFORM_SIGMA * step)
     kept = (distance <= OUTLIER * usual) | (usual == 0.0)
     return replace(reading, t=reading.t[kept], values=reading.values[kept])
 
@@ -200,6 +208,7 @@ def _fitted(
     )
     spline = RegressionSpline(
         curve=scipy.interpolate.BSpline(knots, coefficients, DEGREE),
+        t=times,
         spacing=spacing,
         variance=mean * count / max(count - size, 1),
         weights=(of_values, of_slopes),
@@ -365,11 +374,10 @@ def measured_motion(
 
     usable = np.ones((len(t), space.nv), dtype=bool)
     spacing, sigma = np.zeros(space.nv), np.zeros((3, space.nv))
-    for key, (outputs, dofs) in curves.items():
+    for key, (_, dofs) in curves.items():
         spline, own = splines[key], list(dofs)
-        measured = recording.measured[:, list(outputs.values())]
         reach = REACH * max(spline.spacing, step)
-        usable[:, own] &= _is_near(t, recording.t[measured.any(axis=1)], reach)[:, None]
+        usable[:, own] &= _is_near(t, spline.t, reach)[:, None]
         spacing[own] = np.maximum(spacing[own], spline.spacing)
         # A rotation is twice a combination of the changes of a unit quaternion.
         factor = 2.0 if len(dofs) > 1 else 1.0
