@@ -18,6 +18,7 @@ import gzip
 import json
 import re
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 import matplotlib.pyplot as plt
@@ -93,15 +94,26 @@ targets = [ARMATURES]
 guess = 0.005
 bounds = [1e-4, 0.3]
 [parameters.limit]
-targets = [LIMITS]
+targets = [
+    { path = "controller/shoulder_pan:saturation" },
+    { path = "controller/shoulder_lift:saturation" },
+    { path = "controller/elbow_flex:saturation" },
+    { path = "controller/wrist_flex:saturation" },
+    { path = "controller/wrist_roll:saturation" },
+]
 guess = 2.0
 bounds = [0.1, 30.0]
 [parameters.limit_gripper]
-targets = [LIMIT_OF_GRIPPER]
+target = "controller/gripper:saturation"
 guess = 1.0
 bounds = [0.1, 30.0]
 """
-LIMIT = '{ path = "controller/JOINT:saturation" }'
+# What all joints have, by its mark above.
+SHARED_PATHS = {
+    "[KPS]": "controller/JOINT:kp",
+    "[KDS]": "controller/JOINT:kd",
+    "[ARMATURES]": "joint/JOINT:armature",
+}
 # The profile has the acceleration of the register: 254 times 100 steps/s^2 of 2 pi / 4096 rad. The
 # gripper moves as if it had 20 rad/s^2. Only the chirp shows that, which is not fitted. Jumps of
 # 0.24 rad in one log pass faster than such a profile; all other changes are below 0.08.
@@ -131,6 +143,46 @@ bounds = [0.0, 2.0]
 target = "joint/JOINT:damping[1]"
 guess = 0.1
 bounds = [0.0, 5.0]
+"""
+
+# A motion of 4 s for the armature, with the knowledge and the residuals of the fit. Its references
+# are held, so that joint and servo brake together, and the gripper rests.
+DESIGN = """model = "fit/identified.xml"
+earlier = ["fit/estimate.json"]
+rate = 49.850448654037886
+horizon = 4.012
+cost = { criterion = "c", subset = ["armature"], control = 0.0 }
+nuisance.delay = 0.01
+limits = { velocity = 5.0, clearance = 0.005, bandwidth = 8.0 }
+boundary = { start = "rest", end = "rest" }
+descent.seconds = 60.0
+OUTPUTS[initial]
+qpos = [0.0, 0.0, 0.5, 0.0, 0.0, 0.5]
+[initial.control]
+kind = "multisine"
+fade = 1.5
+offset = { elbow_flex = 0.5, gripper = 0.5 }
+[initial.control.amplitude]
+shoulder_pan = 0.3
+shoulder_lift = 0.1
+elbow_flex = 0.1
+wrist_flex = 0.3
+wrist_roll = 0.3
+gripper = 0.0
+[parameters.kp]
+targets = [KPS]
+[parameters.armature]
+targets = [ARMATURES]
+"""
+FRICTION = """
+[parameters.damping_JOINT]
+target = "joint/JOINT:damping"
+scale = 0.1
+[parameters.friction_JOINT]
+target = "joint/JOINT:frictionloss"
+[parameters.drag_JOINT]
+target = "joint/JOINT:damping[1]"
+scale = 0.1
 """
 
 # Changes of the model: what touches the table, and no creep in dry friction, which is 1 to 2 mrad/s
@@ -178,6 +230,11 @@ def numbers_of(row: str) -> Array:
     return np.broadcast_to([float(number) for number in row.split()], 6)
 
 
+def of_joints(text: str, joints: Sequence[str] = JOINTS) -> str:
+    """A text for each joint."""
+    return "".join(text.replace("JOINT", joint) for joint in joints)
+
+
 def main() -> int:
     """Fit, predict, and print the errors of all motions."""
     parser = options_of(__doc__)
@@ -188,22 +245,17 @@ def main() -> int:
     for change in CHANGES.items():
         text = text.replace(*change)
     (output / "so101.xml").write_text(text, encoding="utf-8")
-    duty = [LIMIT.replace("JOINT", joint) for joint in JOINTS]
-    shared = {
-        "KPS": ", ".join(f'{{ path = "controller/{joint}:kp" }}' for joint in JOINTS),
-        "KDS": ", ".join(f'{{ path = "controller/{joint}:kd" }}' for joint in JOINTS),
-        "ARMATURES": ", ".join(f'{{ path = "joint/{joint}:armature" }}' for joint in JOINTS),
-        "LIMITS": ", ".join(duty[:-1]),
-        "LIMIT_OF_GRIPPER": duty[-1],
-    }
-    outputs, laws = (
-        "".join(text.replace("JOINT", each) for each in JOINTS) for text in (OUTPUT, JOINT)
-    )
+    outputs = of_joints(OUTPUT)
     # The gripper is the last joint.
-    laws = laws.replace("ACCELERATION", "38.96", len(JOINTS) - 1).replace("ACCELERATION", "20.0")
+    laws = of_joints(JOINT).replace("ACCELERATION", "38.96", 5).replace("ACCELERATION", "20.0")
     tables = ARM + outputs + SHARED + laws
-    for name, paths in shared.items():
-        tables = tables.replace(f"[{name}]", f"[{paths}]")
+    design = DESIGN.replace("OUTPUTS", outputs) + of_joints(FRICTION, JOINTS[:-1])
+    for mark, path in SHARED_PATHS.items():
+        paths = of_joints(f'{{ path = "{path}" }}, ')
+        tables, design = (each.replace(mark, f"[{paths}]") for each in (tables, design))
+    # A design needs servos without laws.
+    design = design.replace("controller", "actuator")
+    (output / "design.toml").write_text(design, encoding="utf-8")
     if args.select:
         tables = re.sub(r"\[parameters\.(kd|drag_\w+)\]\n(\w.*\n)*", "", tables)
         tables = re.sub(r"(?m)^(kd|reference_velocity) = .*\n", "", tables)
@@ -222,28 +274,27 @@ def main() -> int:
 
     begun = time.perf_counter()
     console = Console(width=200)
+    whole, identify = slice(None), mjfim.select_terms if args.select else mjfim.identify
+    fitted = [
+        recording(name, whole if args.select else slice(*rows)) for name, rows in FITTED.items()
+    ]
     if args.select:
-        fitted = [recording(name, slice(None)) for name in FITTED]
         motions = {name: motions[name] for name in HELD_OUT.split()}
-    else:
-        fitted = [recording(name, slice(*rows)) for name, rows in FITTED.items()]
-    held_out = [recording(name, slice(None)) for name in motions]
-    if args.select:
-        found = mjfim.select_terms(experiment, fitted, held_out=held_out)
-        console.print(str(found.selection))
-    else:
-        found = mjfim.identify(experiment, fitted, held_out=held_out)
-    console.print(*found.warnings, sep="\n")
+    found = identify(experiment, fitted, held_out=[recording(name, whole) for name in motions])
+    console.print(str(found.selection), *found.warnings, sep="\n")
     found.plot("residual_torque", file=output / "residual_torque.png")
+    found.save(output / "fit")
+    found.save_model(output / "fit" / "identified.xml")
     values = np.column_stack([found.theta, found.interval]).round(5).tolist()
     console.print(dict(zip(found.parameters, values, strict=True)))
     console.print(f"{(time.perf_counter() - begun) / 60.0:.1f} minutes")
 
-    table = new_table("rms error [mrad]", "motion", "all", *JOINTS, *PUBLISHED)
-    zeros = new_table("rms error [mrad] with the best zeros", "motion", *PUBLISHED)
-    predictions = found.predictions[-len(motions) :]
-    for (name, motion), prediction in zip(motions.items(), predictions, strict=True):
-        errors = 1e3 * (prediction.identified_outputs - motion[:, 6:])
+    table = new_table("rms error (mrad)", "motion", "all", *JOINTS, *PUBLISHED)
+    zeros = new_table("rms error with the best zeros (mrad)", "motion", *PUBLISHED)
+    own = [each.identified_outputs for each in found.predictions[-len(motions) :]]
+    predicted = dict(zip(motions, own, strict=True))
+    for name, motion in motions.items():
+        errors = 1e3 * (predicted[name] - motion[:, 6:])
         theirs, best = np.transpose(
             [published_rms(model, each, motion) for each in PUBLISHED.values()]
         )
@@ -255,15 +306,14 @@ def main() -> int:
 
     # Ratios that the motions determine. Torques have no scale without a load, so that sets with
     # other gains may move alike. Intervals are those of the numerators.
-    heads = [f"{name} / kp [{unit}]" for name, (unit, _) in QUANTITIES.items()]
+    heads = [f"{name} / kp ({unit})" for name, (unit, _) in QUANTITIES.items()]
     ratios = new_table(f"estimate | {', '.join(PUBLISHED)}", "joint", *heads)
     places = {name: i for i, name in enumerate(found.parameters)}
     published = [[numbers_of(row) for row in text.split("|")] for text in PUBLISHED.values()]
     for number, joint in enumerate(JOINTS):
         cells = []
         for name, (_, scale) in QUANTITIES.items():
-            own = f"{name}_{joint}"
-            place = places[own if own in places else name]
+            place = places.get(f"{name}_{joint}", places.get(name))
             value, (low, high) = found.theta[place], found.interval[place]
             others = []
             for gain, _, kd, armature, friction, damping in published:
@@ -278,21 +328,24 @@ def main() -> int:
         ratios.add_row(joint, *cells)
     console.print(ratios)
 
+    # What one motion shows by itself, as half the width of a 95 % interval.
+    place = places["armature"]
+    before, after = found.honest_std[place], mjfim.design(output / "design.toml").final.std[1]
+    alone = 1.96 / found.theta[place] / np.sqrt(after**-2 - before**-2)
+    console.print(f"armature: ±{alone:.0%} by 4 s, ±10 % in {400 / 60 * alone**2:.1f} minutes")
+
     # The parts of `SHOWN`: measured angles, their references, and their predictions.
-    figure, rows = plt.subplots(
-        2, len(SHOWN), figsize=(13.0, 6.5), layout="constrained", squeeze=False
-    )
-    outputs_of = dict(zip(motions, (each.identified_outputs for each in predictions), strict=True))
-    for axes, (name, (joints, first, last)) in zip(rows.T, SHOWN.items(), strict=True):
+    figure, grid = plt.subplots(2, len(SHOWN), figsize=(13.0, 6.5), layout="constrained")
+    for axes, (name, (joints, first, last)) in zip(grid.T, SHOWN.items(), strict=True):
         t, motion = PERIOD * np.arange(first, last), motions[name][first:last]
         for axis, joint in zip(axes, joints, strict=True):
             j = JOINTS.index(joint)
             axis.plot(t, motion[:, j], color="0.5", lw=0.8, label="reference")
-            axis.plot(t, outputs_of[name][first:last, j], color="C0", lw=1.6, label="predicted")
+            axis.plot(t, predicted[name][first:last, j], color="C0", lw=1.6, label="predicted")
             axis.plot(t, motion[:, 6 + j], "k:", lw=1.4, label="measured")
             axis.set_ylabel(f"{joint} [rad]")
         axes[0].set_title(f"{name}, not fitted")
         axes[-1].set_xlabel("time [s]")
-    rows[0, 0].legend(loc="upper right", ncols=3)
+    grid[0, 0].legend(loc="upper right", ncols=3)
     figure.savefig(output / "predictions.png", dpi=110)
     return 0
