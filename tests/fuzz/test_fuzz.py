@@ -192,12 +192,10 @@ PLAYED = (
 )
 
 
-def excesses(
-    xml: str, given: Rows, ranges: Ranges, *, period: float = 0.1, feedback: bool = False
-) -> Excess:
+def excesses(xml: str, given: Rows, ranges: Ranges, *, feedback: bool = False) -> Excess:
     """Play rows whose numbers are zero unless they are given."""
     model = mujoco.MjModel.from_xml_string(xml)
-    return play(model, full_rows(model, given, period), ranges, period, feedback)
+    return play(model, full_rows(model, given, 0.1), ranges, 0.1, feedback)
 
 
 @pytest.mark.parametrize(("xml", "rows", "feedback", "largest"), PLAYED)

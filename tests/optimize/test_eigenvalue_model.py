@@ -21,13 +21,13 @@ LIMITS = {"control": {"force": (-9.0, 9.0)}}
 VALUES = {"apart": [0.5, 0.85, 2.0], "meeting": [0.5, 0.5 + 5e-10, 0.525]}
 
 
-def model_of(values: list[float], power: float = 12.0, share: float = 0.6) -> EigenvalueModel:
+def model_of(values: list[float], power: float = 12.0) -> EigenvalueModel:
     """A model without derivatives by state and control."""
     m = len(values) * (len(values) + 1) // 2
     return EigenvalueModel(
         eigenvalues=np.array(values),
         power=power,
-        weight=share,
+        weight=0.6,
         a=np.zeros((m, 2, 1)),
         b=np.zeros((m, 1, 1)),
     )

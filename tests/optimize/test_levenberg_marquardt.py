@@ -134,7 +134,7 @@ def solved(
     return found
 
 
-def decays(sigma: float = 0.01) -> tuple[Rows, ...]:
+def decays() -> tuple[Rows, ...]:
     """Exponential decays with a common rate and offset.
 
     The amplitude of each segment is its private unknown.
@@ -143,9 +143,9 @@ def decays(sigma: float = 0.01) -> tuple[Rows, ...]:
     t = np.linspace(0.0, 2.0, 25)
     found = []
     for amplitude in (1.0, 0.4, -2.0):
-        y = amplitude * np.exp(-1.7 * t) + 0.3 + sigma * rng.standard_normal(len(t))
+        y = amplitude * np.exp(-1.7 * t) + 0.3 + 0.01 * rng.standard_normal(len(t))
         found.append(
-            lambda theta, private, y=y: (private[0] * np.exp(-theta[0] * t) + theta[1] - y) / sigma
+            lambda theta, private, y=y: (private[0] * np.exp(-theta[0] * t) + theta[1] - y) / 0.01
         )
     return tuple(found)
 

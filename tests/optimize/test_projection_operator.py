@@ -312,12 +312,10 @@ def test_the_line_search_ends_with_its_time_and_the_descent_with_its_last_iterat
     assert iterates[-1].value <= iterates[0].value
 
 
-def learned(memory: int, iterations: int = 9) -> tuple[LBFGS, Expansion, Array]:
+def learned(memory: int) -> tuple[LBFGS, Expansion, Array]:
     """An L-BFGS after some iterations, the next expansion, and K."""
     problem, direction = Pendulum(), LBFGS(R * DT, memory)
-    iterates = run(
-        problem, direction, max_iterations=iterations, regulate=replace(REGULATOR, period=1000)
-    )
+    iterates = run(problem, direction, max_iterations=9, regulate=replace(REGULATOR, period=1000))
     K = REGULATOR.gain(problem.expand(iterates[0].point))
     return direction, problem.expand(iterates[-1].point), K
 

@@ -67,13 +67,13 @@ def unconstrained(task: Any) -> tuple[EquationOfMotion, Any]:
     return equation, system.plant.model(task.parameters.guess)
 
 
-def random_points(task: Any, count: int = 5) -> MotionPoints:
+def random_points(task: Any) -> MotionPoints:
     """Points with random states, accelerations and controls."""
     rng = np.random.default_rng(3)
     space, start = task.system.space, task.system.nominal_initial_state
-    states = space.plus(np.tile(start, (count, 1)), 0.5 * rng.standard_normal((count, space.nx)))
-    acceleration = rng.standard_normal((count, space.nv))
-    return states, acceleration, 0.3 * rng.standard_normal((count, task.system.plant.nu))
+    states = space.plus(np.tile(start, (5, 1)), 0.5 * rng.standard_normal((5, space.nx)))
+    acceleration = rng.standard_normal((5, space.nv))
+    return states, acceleration, 0.3 * rng.standard_normal((5, task.system.plant.nu))
 
 
 @pytest.mark.parametrize("integrator", ["Euler", "implicit", "implicitfast", "RK4"])

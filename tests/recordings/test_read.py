@@ -62,19 +62,18 @@ T = np.arange(M) * 0.005
 CTRL = {"ctrl:push": np.cos(T), "ctrl:turn": np.sin(3.0 * T)}
 
 
-def task_of(folder: Path, recording: Mapping[str, Any], model: str = ARM) -> DesignTask:
+def task_of(folder: Path, recording: Mapping[str, Any]) -> DesignTask:
     """The arm on its cart, with this [recording] table."""
-    (folder / "arm.xml").write_text(model, encoding="utf-8")
+    (folder / "arm.xml").write_text(ARM, encoding="utf-8")
     mass = {"mass": {"target": "body/arm:mass"}}
     start = {"control": {"kind": "sine"}}
-    noise = NOISE if model == ARM else {"state": 0.01}
     experiment = Experiment(
         model="arm.xml",
         rate=100.0,
         horizon=1.0,
         initial=start,
         parameters=mass,
-        noise=noise,
+        noise=NOISE,
         recording=recording,
         directory=folder,
         source="study.toml",

@@ -127,12 +127,10 @@ def make_design(dofs: int = 2, count: int = 3) -> Design:
     )
 
 
-def make_trials(
-    theta: Array, std: float, failed: int, seed: int, trials: int = 200
-) -> TrialStatistics:
+def make_trials(theta: Array, std: float, failed: int, seed: int) -> TrialStatistics:
     """Make efficient estimates; the first `failed` rows are NaN."""
     count = len(theta)
-    estimates = theta + std * np.random.default_rng(seed).normal(size=(trials, count))
+    estimates = theta + std * np.random.default_rng(seed).normal(size=(200, count))
     estimates[:failed] = np.nan
     spread = np.diag(np.full(count, std**2))
     interval = np.tile([0.8, 1.2], (count, 1))
@@ -143,7 +141,7 @@ def make_trials(
         crlb=spread,
         efficiency=np.ones(count),
         efficiency_interval=interval,
-        trials=trials,
+        trials=200,
         failed=failed,
     )
 
