@@ -6,7 +6,9 @@ joint limits and clamped actuators.
 A derivative says what an infinitely small change of a parameter does. Dry friction, contacts and
 strong curvature answer otherwise to a change as large as the standard deviation. The outputs are
 simulated at theta - 2 s v and theta + 2 s v, along each principal direction v of the covariance
-with the standard deviation s. Where the derivatives hold, the whitened outputs differ by 4.
+with the standard deviation s. Where the derivatives hold, the whitened outputs differ by 4. The
+covariance is that of difference steps of up to 2 s: those of shorter ones may be too small by any
+factor, where a contact sticks and slips.
 
 Where a motion hardly determines a parameter, the largest such step shows it: two robots that differ
 much, whose outputs differ by less than a test of the noise can tell.
@@ -114,9 +116,7 @@ def steps_disagree(
             return np.array([np.nan])
         return np.asarray(disagreement(G, noise.whiten(coarse.G))[:, visible].max(axis=0))
 
-    # Ratio of the second to the first difference step of each parameter.
-    factors = LONGER_STEP_FACTOR * plant.parameters.magnitude / derivatives.parameter_scale
-    factors = np.maximum(factors, LEAST_STEP_FACTOR)
+    factors = _longer_factors(plant)
     longer = error(factors)
     if longer.max(initial=0.0) <= DISAGREEMENT_TOLERANCE:
         return False
@@ -127,6 +127,12 @@ def steps_disagree(
     # Dry friction may switch between the shorter steps as well, however little they disagree.
     tolerated = 0.0 if plant.model(theta).dof_frictionloss.any() else DISAGREEMENT_TOLERANCE
     return not only_curved(error(medium), longer, tolerated)
+
+
+def _longer_factors(plant: Plant) -> Array:
+    """(p,) ratios of the second to the first difference step of each parameter."""
+    factors = LONGER_STEP_FACTOR * plant.parameters.magnitude / plant.derivatives.parameter_scale
+    return np.maximum(factors, LEAST_STEP_FACTOR)
 
 
 def only_curved(medium: Array, longer: Array, tolerated: float) -> bool:
@@ -193,6 +199,13 @@ def finite_steps(
         predicted: (p,) standard deviations by derivatives, infinite where there are none.
     """
     p = plant.parameters
+    # The shortest steps may show little more than how contacts chatter.
+    shortest = SENSITIVITY_STEP * plant.derivatives.parameter_scale
+    factors = np.clip(STEP_LENGTH * predicted / shortest, 1.0, _longer_factors(plant))
+    sensitivity = plant.derivatives.sensitivity(theta, trajectory, factors * SENSITIVITY_STEP)
+    if sensitivity is not None:
+        G = noise.whiten(sensitivity.G).reshape(-1, len(theta))
+        information = prior + G.T @ G
     unit, size = scaled_to_unit_diagonal(information)
     values, vectors = np.linalg.eigh(unit)
     known = values > SINGULAR_RATIO * values[-1]

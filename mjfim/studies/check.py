@@ -620,7 +620,7 @@ def _rows(
         wanted = parameter.wanted or DEFAULT_RELATIVE_STD * size
         repetitions = 0
         if not parameter.nuisance:
-            repetitions = _repetitions(task, data, information, j, wanted)
+            repetitions = _repetitions(task, data, information, j, wanted / float(std[j]))
         yield ParameterCheck(
             name=parameter.name,
             unit=parameter.unit,
@@ -638,16 +638,20 @@ def _rows(
 
 
 def _repetitions(
-    task: DesignTask, data: Array, information: FisherInformation, parameter: int, wanted: float
+    task: DesignTask, data: Array, information: FisherInformation, parameter: int, share: float
 ) -> int:
-    """Smallest number of repetitions that reaches the wanted standard deviation; 0 for none."""
+    """Smallest number of repetitions that leave a share of the present σ; 0 for none."""
     place = np.flatnonzero(task.parameters.interest == parameter)[0]
 
-    def suffices(repetitions: int) -> bool:
-        covariance = information.covariance(repetitions * data + task.prior)
-        return bool(covariance[place, place] <= wanted**2)
+    def variance(repetitions: int) -> float:
+        return float(information.covariance(repetitions * data + task.prior)[place, place])
 
-    if suffices(1):
+    present = variance(1)
+
+    def suffices(repetitions: int) -> bool:
+        return variance(repetitions) <= present * share**2
+
+    if share >= 1.0:
         return 1
     found = bisect_left(range(MAX_REPETITIONS + 1), True, lo=2, key=suffices)
     return found if found <= MAX_REPETITIONS else 0

@@ -66,7 +66,9 @@ def run(case: Case, folder: Path) -> Outcome:
     rng = case.rng
     spoils = {"permission": no_permission, "log": long_log}
     spoil = spoils.get(case.kind, bad_input)
-    if case.kind == "permission" and not may_be_refused():
+    # Linux takes the rights of root away.
+    may_be_refused = sys.platform == "linux" or (hasattr(os, "geteuid") and os.geteuid() != 0)
+    if case.kind == "permission" and not may_be_refused:
         reason = "skipped: this user may do everything"
         return Outcome(case=case, group="skipped", description=reason)
     for name in STUDY:
@@ -174,11 +176,6 @@ def _without_home(folder: Path) -> dict[str, str]:
     kept = {k: v for k, v in os.environ.items() if not k.startswith(("XDG_", "MPL"))}
     home = folder / "home" if (folder / "home").is_dir() else "/dev/null/home"
     return {**kept, "HOME": str(home), "MPLBACKEND": "Agg"}
-
-
-def may_be_refused() -> bool:
-    """Whether the permissions of files can hold for a call: Linux takes the rights of root away."""
-    return sys.platform == "linux" or (hasattr(os, "geteuid") and os.geteuid() != 0)
 
 
 @contextlib.contextmanager

@@ -88,13 +88,9 @@ def faults_in(files: Iterable[Path], *, may_be_temporary: bool = False) -> list[
     """Describe the files that are not whole, and temporary files that should have been removed."""
     found: list[str] = []
     for path in sorted(file for file in files if file.is_file()):
-        if not is_temporary(path):
+        # A temporary file should have been renamed or removed.
+        if TEMPORARY.match(path.name) is None:
             found += faults_of(path)
         elif not may_be_temporary:
             found.append(f"{path.name} is a temporary file that stayed")
     return found
-
-
-def is_temporary(path: Path) -> bool:
-    """True for a temporary file that should have been renamed or removed."""
-    return TEMPORARY.match(path.name) is not None

@@ -226,11 +226,6 @@ def test_the_interval_for_another_recording_is_that_of_student() -> None:
         assert_allclose(found[0], [3.5 - half, 3.5 + half], rtol=1e-6)
 
 
-def part_of(J: Array, b: Array) -> Array:
-    """Information and its product with the estimate, from rows and their values."""
-    return np.column_stack([J.T @ J, J.T @ b])
-
-
 @pytest.mark.parametrize("ranks", [[4, 4], [2, 3, 4], [1, 1, 1, 1], [2, 2, 1]])
 def test_difference_is_the_increase_of_squares(ranks: list[int]) -> None:
     """Dense least squares with one theta for each part, and with one for all."""
@@ -238,7 +233,7 @@ def test_difference_is_the_increase_of_squares(ranks: list[int]) -> None:
     size = 4
     rows = [rng.normal(size=(rank, size)) for rank in ranks]
     y = [rng.normal(size=rank) for rank in ranks]
-    parts = np.array([part_of(J, b) for J, b in zip(rows, y, strict=True)])
+    parts = np.array([np.column_stack([J.T @ J, J.T @ b]) for J, b in zip(rows, y, strict=True)])
 
     # Each part alone explains its data exactly, because it has at most as many rows as unknowns.
     J, b = np.concatenate(rows), np.concatenate(y)

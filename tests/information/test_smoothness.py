@@ -9,15 +9,25 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from mjfim.excitation.task import DesignTask
 from mjfim.information.finite_steps import (
     disagreement,
+    finite_steps,
     only_curved,
     steps_disagree,
 )
 from mjfim.plant.plant import Derivatives
-from tests.support.numerics import Array, Loop, body_task, cart_task, filtered_task, make_task
+from tests.support.numerics import (
+    Array,
+    Loop,
+    body_task,
+    cart_task,
+    filtered_task,
+    make_task,
+    sensitivity_of,
+)
 
 SLIDER = """
 <mujoco model="slider">
@@ -80,7 +90,6 @@ def along(task: DesignTask) -> bool:
 @pytest.mark.parametrize(
     "make",
     [cart_task, body_task, filtered_task, slider, lambda f: ball(f, 0.15)],
-    ids=["cart", "free body", "activation", "slider", "ball in the air"],
 )
 def test_a_smooth_motion_is_not_flagged(make, tmp_path) -> None:
     assert not along(make(tmp_path))
@@ -109,13 +118,11 @@ def test_contacts_and_limits_are_flagged(tmp_path) -> None:
     assert along(slider(tmp_path, 'limited="true" range="-0.05 0.15"'))
 
 
-@pytest.mark.parametrize(("amplitude", "flagged"), [(1.9, False), (2.0001, True)])
-def test_a_force_that_just_meets_its_range_is_flagged(
-    amplitude: float, flagged: bool, tmp_path
-) -> None:
+def test_a_force_that_just_meets_its_range_is_flagged(tmp_path) -> None:
     limited = 'forcelimited="true" forcerange="-2 2"'
     gain = {"target": "actuator/push:gainprm[0]"}
-    assert along(slider(tmp_path, motor=limited, amplitude=amplitude, gain=gain)) == flagged
+    for amplitude, flagged in ((1.9, False), (2.0001, True)):
+        assert along(slider(tmp_path, motor=limited, amplitude=amplitude, gain=gain)) == flagged
 
 
 def sensed(seed: int = 0) -> Array:
@@ -164,9 +171,29 @@ def test_a_model_that_diverges_under_the_longer_step_is_rough(tmp_path, monkeypa
 
 
 def test_disagreements_below_the_tolerance_need_not_decrease() -> None:
-    # The first derivative exists, although the longer step reaches the end of a joint's range.
-    assert only_curved(np.array([6e-5, 5e-9]), np.array([0.87, 2.6e-8]), 0.01)
-    assert not only_curved(np.array([6e-5, 5e-9]), np.array([0.87, 2.6e-8]), 0.0)
-    assert only_curved(np.array([0.12, 8e-3]), np.array([0.79, 0.037]), 0.01)
-    assert not only_curved(np.array([0.5, 5e-9]), np.array([0.87, 2.6e-8]), 0.01)
-    assert not only_curved(np.array([6e-5, 0.02]), np.array([0.87, 2.6e-8]), 0.01)
+    for medium, longer, tolerated, is_only_curved in (
+        # The first derivative exists, although the longer step reaches the end of a joint's range.
+        ((6e-5, 5e-9), (0.87, 2.6e-8), 0.01, True),
+        ((6e-5, 5e-9), (0.87, 2.6e-8), 0.0, False),
+        ((0.12, 8e-3), (0.79, 0.037), 0.01, True),
+        ((0.5, 5e-9), (0.87, 2.6e-8), 0.01, False),
+        ((6e-5, 0.02), (0.87, 2.6e-8), 0.01, False),
+    ):
+        assert only_curved(np.array(medium), np.array(longer), tolerated) == is_only_curved
+
+
+def test_finite_steps_correct_derivatives_that_are_wrong_by_any_factor(tmp_path) -> None:
+    task = slider(tmp_path)
+    noise, theta = task.system.noise, task.theta
+    G = noise.whiten(sensitivity_of(task).G).reshape(-1, 2)
+    std, wrong = np.sqrt(np.diag(np.linalg.inv(G.T @ G))), 1e10 * np.eye(2)
+    found = finite_steps(
+        task.plant,
+        noise,
+        theta,
+        task.initial,
+        information=wrong,
+        prior=0.0 * wrong,
+        predicted=1e-4 * std,
+    )
+    assert_allclose(found.std, std, rtol=0.01)

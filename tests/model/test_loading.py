@@ -5,7 +5,6 @@ included.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -31,11 +30,6 @@ ROUGH = {
 TOGETHER = {"double_pendulum", "ball_pendulum"}  # not every parameter can be told alone
 
 
-def slow_except(*fast: str) -> list[Any]:
-    """All examples as parameters of a test, marked as slow but for those named."""
-    return [pytest.param(name, marks=[] if name in fast else pytest.mark.slow) for name in EXAMPLES]
-
-
 def shortened(name: str, folder: Path) -> mjfim.Experiment:
     """An example of half of its horizon, which few robots rehearse."""
     stated = mjfim.Experiment.from_file(design_file(name, folder))
@@ -46,7 +40,10 @@ def test_every_model_has_an_experiment() -> None:
     assert {path.stem for path in MODELS.glob("*.xml")} == {*EXAMPLES, "cart_pendulum"}
 
 
-@pytest.mark.parametrize("name", slow_except("four_bar"))
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(x, marks=[] if x == "four_bar" else pytest.mark.slow) for x in EXAMPLES],
+)
 def test_check_names_the_subject_of_the_example(name: str, tmp_path: Path) -> None:
     found = mjfim.check(shortened(name, tmp_path))
     assert np.isfinite(found.self_test.slope)

@@ -701,11 +701,6 @@ def test_the_message_about_a_wrong_path_names_valid_values(path: str, said: list
         assert part in message
 
 
-def in_arm(folder: Path, tables: dict) -> Any:
-    """DesignTask of an experiment on ARM."""
-    return make_task(ARM, folder, rate=500.0, horizon=0.1, parameters=tables, noise={"state": 0.1})
-
-
 @pytest.mark.parametrize("key", ["guess", "true"])
 @pytest.mark.parametrize(
     ("field", "value", "fault"),
@@ -728,7 +723,7 @@ def test_unphysical_bodies_are_refused_before_a_simulation(
 ) -> None:
     table = {"theta": {"target": f"body/a:{field}", "scale": 1.0, key: value}}
     with pytest.raises(ExperimentError, match=rf"parameters\.theta\.{key}: body 'a' has {fault}"):
-        in_arm(tmp_path, table)
+        make_task(ARM, tmp_path, rate=500.0, parameters=table, noise={"state": 0.1})
 
 
 @pytest.mark.parametrize("field", ["origininertia[0]", "fullinertia[0]", "mass"])

@@ -41,7 +41,9 @@ def _visible_texts(figure: Figure) -> tuple[list[str], list[Bbox]]:
     hidden = {id(text) for text in _texts_of_unused_ticks(figure)}
     texts, boxes = [], []
     for artist in figure.findobj(Text):
-        if not isinstance(artist, Text) or id(artist) in hidden or not _is_drawn(artist):
+        if not isinstance(artist, Text) or id(artist) in hidden or not artist.get_visible():
+            continue
+        if artist.axes is not None and not artist.axes.get_visible():
             continue
         words = artist.get_text().strip()
         if words:
@@ -65,11 +67,6 @@ def _box(text: Text) -> Bbox:
         return Bbox.from_extents(box.x0, top - box.height, box.x1, top)
     finally:
         text.set_text(whole)
-
-
-def _is_drawn(text: Text) -> bool:
-    """Return whether a text and everything that holds it is visible."""
-    return bool(text.get_visible()) and (text.axes is None or bool(text.axes.get_visible()))
 
 
 def _texts_of_unused_ticks(figure: Figure) -> list[Text]:

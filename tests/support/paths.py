@@ -4,18 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
-
-def _repository() -> Path:
-    """Return the nearest folder above this file that holds pyproject.toml."""
-    for folder in Path(__file__).resolve().parents:
-        if (folder / "pyproject.toml").is_file():
-            return folder
-
-    raise FileNotFoundError(f"no pyproject.toml in a folder above {__file__}")
-
-
-# The top folder of the repository.
-ROOT = _repository()
+# The top folder of the repository: the nearest one above this file that holds pyproject.toml.
+ROOT = next(
+    folder for folder in Path(__file__).resolve().parents if (folder / "pyproject.toml").is_file()
+)
 
 # The experiments and MuJoCo models that the package ships.
 MODELS = ROOT / "models"
