@@ -281,7 +281,7 @@ def main() -> int:
     if args.select:
         motions = {name: motions[name] for name in HELD_OUT.split()}
     found = identify(experiment, fitted, held_out=[recording(name, whole) for name in motions])
-    console.print(str(found.selection), *found.warnings, sep="\n")
+    console.print(f"{found.selection or ''}", *found.warnings, sep="\n")
     found.plot("residual_torque", file=output / "residual_torque.png")
     found.save(output / "fit")
     found.save_model(output / "fit" / "identified.xml")
@@ -332,10 +332,12 @@ def main() -> int:
     place = places["armature"]
     before, after = found.honest_std[place], mjfim.design(output / "design.toml").final.std[1]
     alone = 1.96 / found.theta[place] / np.sqrt(after**-2 - before**-2)
-    console.print(f"armature: ±{alone:.0%} by 4 s, ±10 % in {400 / 60 * alone**2:.1f} minutes")
+    console.print(f"armature: ±{alone:.0%} by 4 s, ±10 % in {6.7 * alone**2:.1f} minutes")
 
     # The parts of `SHOWN`: measured angles, their references, and their predictions.
-    figure, grid = plt.subplots(2, len(SHOWN), figsize=(13.0, 6.5), layout="constrained")
+    figure, grid = plt.subplots(
+        2, len(SHOWN), figsize=(13.0, 6.5), layout="constrained", squeeze=False
+    )
     for axes, (name, (joints, first, last)) in zip(grid.T, SHOWN.items(), strict=True):
         t, motion = PERIOD * np.arange(first, last), motions[name][first:last]
         for axis, joint in zip(axes, joints, strict=True):
@@ -347,5 +349,5 @@ def main() -> int:
         axes[0].set_title(f"{name}, not fitted")
         axes[-1].set_xlabel("time [s]")
     grid[0, 0].legend(loc="upper right", ncols=3)
-    figure.savefig(output / "predictions.png", dpi=110)
+    figure.savefig(output / "predictions.png")
     return 0

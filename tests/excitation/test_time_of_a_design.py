@@ -86,8 +86,9 @@ def test_a_design_uses_its_time_and_not_much_more(
     task = task.restated(task.experiment.replace(rehearsal={"robots": 0}))
     begun = clock()
     design = design_task(task)
-    # What sensors tell comes after it as well: the sensitivities with a longer difference step.
-    sensing = 2 * len(task.theta) * task.samples * task.system.grid.substeps
+    # What sensors tell and finite steps come after it as well: the sensitivities with two longer
+    # difference steps.
+    sensing = 4 * len(task.theta) * task.samples * task.system.grid.substeps
     used = clock() - begun - sensing / STEPS_PER_SECOND
     assert design.status is Status.MAX_ITERATIONS
     assert 0.9 * seconds < used < 1.2 * seconds
