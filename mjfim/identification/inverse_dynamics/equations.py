@@ -506,7 +506,8 @@ def _residual(
     model, motion = equations.system.plant.model(theta), each.motion
     if isinstance(simulator, ClosedLoopSimulator):
         states = np.concatenate([motion.qpos, motion.qvel], axis=1)
-        ctrl = simulator.controls_along(model, motion.t, states, motion.recording.ctrl)
+        inputs = motion.recording.ctrl[: int(np.ceil(motion.t[-1] / motion.recording.dt))]
+        ctrl = simulator.controls_along(model, motion.t, states, inputs)
         motion = replace(motion, recording=replace(motion.recording, ctrl=ctrl))
         equations = replace(equations, laws=None)
     (points,) = equations.points([model], motion, theta[None])
