@@ -868,6 +868,7 @@ BEHIND = {
     "limits.position": "about the start; for a soft range of the MJCF, so wide that it holds there",
     "limits.tendon_length": "wider than in the MJCF, whose soft range the state at rest exceeds",
     "limits.clearance": "between bodies [m]; ignored pairs are nearer at the start",
+    "limits.ignored": "bodies that touch brake each other, unless the MJCF has an <exclude>",
     "limits.floor": "height of the floor, which not all bodies touch in the MJCF [m]",
     "limits.reserve": "as much as robots that differ from the model need",
     "limits.bandwidth": "of the controls [Hz]; a larger one gives more information",
