@@ -200,9 +200,9 @@ def finite_steps(
     """
     p = plant.parameters
     # The shortest steps may show little more than how contacts chatter.
-    shortest = SENSITIVITY_STEP * plant.derivatives.parameter_scale
-    factors = np.clip(STEP_LENGTH * predicted / shortest, 1.0, _longer_factors(plant))
-    sensitivity = plant.derivatives.sensitivity(theta, trajectory, factors * SENSITIVITY_STEP)
+    step = STEP_LENGTH * predicted / plant.derivatives.parameter_scale
+    step = np.clip(step, SENSITIVITY_STEP, SENSITIVITY_STEP * _longer_factors(plant))
+    sensitivity = plant.derivatives.sensitivity(theta, trajectory, step)
     if sensitivity is not None:
         G = noise.whiten(sensitivity.G).reshape(-1, len(theta))
         information = prior + G.T @ G

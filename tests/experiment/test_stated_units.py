@@ -186,6 +186,10 @@ WRONG = {
         "initial.control.amplitude.servo: '1 N m' is no number in rad … deg",
     ),
     "noise of all": (
+        {"noise": {"state": "1 mm"}},
+        "noise.state: '1 mm' would stand for numbers in m and rad … by its name",
+    ),
+    "wrong noise of all": (
         {"noise": {"state": "1 kg"}},
         "noise.state: '1 kg' is no number in m or rad … units m, cm, mm, rad, deg, rev",
     ),

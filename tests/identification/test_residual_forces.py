@@ -44,7 +44,7 @@ def rough_log(folder: Path, sigma: float) -> Recording:
 
 def test_medians_step_by_the_friction_that_the_model_lacks(tmp_path: Path) -> None:
     slide, hinge = forces_along(cart(tmp_path), rough_log(tmp_path, 1e-3))
-    assert (slide.joint, slide.unit, hinge.unit) == ("slide", "N", "N m")
+    assert [slide.joint, slide.unit, hinge.joint, hinge.unit] == ["slide", "N", "hinge", "N m"]
     for sign in (1.0, -1.0):
         for each, friction in ((slide, sign * FRICTION), (hinge, 0.0)):
             # Without the slowest median, in which noise mixes the directions.

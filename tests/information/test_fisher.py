@@ -20,7 +20,6 @@ from mjfim.records.trajectory import Sensitivity
 from tests.support.numerics import (
     PRODUCT,
     cart_task,
-    independent_noise,
     relative_error,
     richardson,
     sensitivity_of,
@@ -31,7 +30,7 @@ SIGMA = np.array([0.1, 0.5, 2.0])
 
 def information(stride: int = 1, criterion: str = "E", **changes) -> FisherInformation:
     """Three outputs, four parameters of different scale, no prior."""
-    noise = independent_noise(SIGMA, stride)
+    noise = Noise(covariance=np.diag(SIGMA**2), strides=np.full(len(SIGMA), stride))
     base = FisherInformation(
         noise=noise,
         measure_rate=50.0,

@@ -86,12 +86,6 @@ def left(faults: list[str]) -> list[str]:
     return [fault for fault in faults if not fault.startswith(("file:", "data:", "blob:"))]
 
 
-def rgb_text(colour: str) -> str:
-    """A colour as the browser writes it."""
-    red, green, blue = bytes.fromhex(colour.removeprefix("#"))
-    return f"rgb({red}, {green}, {blue})"
-
-
 def test_every_plot_is_visible_in_every_window_and_theme(browser: Any, tmp_path: Path) -> None:
     """No message, no request, no horizontal scrolling of the page, and no empty plot.
 
@@ -134,7 +128,10 @@ def test_a_name_in_the_legend_hides_its_curves(browser: Any, tmp_path: Path) -> 
     expect(curves).to_have_count(1)
     assert key.get_attribute("aria-pressed") == "false"
     page.emulate_media(color_scheme="dark")
-    expect(curves.locator("path.js-line")).to_have_css("stroke", rgb_text(DESIGNED.colour_on_dark))
+    # The browser writes a colour as three numbers.
+    red, green, blue = bytes.fromhex(DESIGNED.colour_on_dark.removeprefix("#"))
+    stroke = f"rgb({red}, {green}, {blue})"
+    expect(curves.locator("path.js-line")).to_have_css("stroke", stroke)
     expect(curves).to_have_count(1)
     key.click()
     expect(curves).to_have_count(2)

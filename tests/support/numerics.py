@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
-from mjfim.plant.outputs import Noise
 from mjfim.records.trajectory import Sensitivity
 from tests.support.paths import SHARED_MODELS
 
@@ -283,14 +282,6 @@ def relative_error(value: Array, reference: Array) -> float:
     """Largest deviation, relative to the largest reference entry."""
     assert value.shape == reference.shape
     return np.abs(value - reference).max() / np.abs(reference).max()
-
-
-def independent_noise(sigma: Sequence[float] | Array, stride: int = 1) -> Noise:
-    """Noise of uncorrelated outputs that are measured at the same samples."""
-    return Noise(
-        covariance=np.diag(np.asarray(sigma, dtype=np.float64) ** 2),
-        strides=np.full(len(sigma), stride),
-    )
 
 
 def require_found(found: Any, true: Array, sigmas: float = 4.0) -> None:
